@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import CheckpointError
+from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 
 AGAIN = "run again without --resume"
@@ -49,6 +50,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> str:
     Raises OSError: the file cannot be written in full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    note(path)
     with path.open("wb") as file:
         hashed = _Hashed(file)
         np.savez(hashed, allow_pickle=False, **arrays)
@@ -83,6 +85,7 @@ def write_manifest(path: Path, entry: Mapping[str, Any]) -> None:
     Raises OSError: it cannot be written; the old one stays.
     """
     fresh = path.with_suffix(".new")
+    note(fresh, path)
     with fresh.open("w") as file:
         file.write(json.dumps({**entry, "sha256": _checksum(entry)}, indent=2) + "\n")
         file.flush()

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
+from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.model import ModelError, Outputs, ReducedModel
 from softgrasp.reduction.operators import Reconstruction
@@ -165,6 +166,7 @@ def write_model(
         with agree(comm):
             if comm.rank == 0:
                 path.parent.mkdir(parents=True, exist_ok=True)
+                note(unfinished, path)
                 with h5py.File(unfinished, "w") as file:
                     file.attrs["format"], file.attrs["model"] = kind, json.dumps(about)
                     small(file)

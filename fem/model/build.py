@@ -175,7 +175,7 @@ def build(
     mesh: TissueMesh | None = None,
     run: bool = True,
 ) -> Model:
-    """M q'' + D q' + K q = f + B_u u for q = [q_s; q_e], as in [SBRH21]: mesh, assemble, couple. Collective.
+    """The model of a scene on its a-priori mesh or another; :mod:`softgrasp.fem.accuracy.adapt` refines. Collective.
 
     Args:
         scene: a scene, the path of its file, or the name of one that ships.
@@ -187,10 +187,6 @@ def build(
         SceneError, MeshError: with one sentence that names the key or the file.
         ResourceError: the memory of a node cannot hold it; estimated before anything is allocated, for a mesh file
             when its cells are known.
-
-    >>> import softgrasp as sg
-    >>> sg.build("paper_forward").states
-    1916
     """
     if isinstance(scene, str | Path):
         scene = load_scene_collective(comm, scene, overrides)

@@ -13,9 +13,10 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.checksums import AGAIN
-from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError, SceneError, SolverError, agree
+from softgrasp.fem.errors import CheckpointError, Interrupted, Paused, ResourceError, SceneError, SolverError, agree
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import Output, make_outputs
+from softgrasp.fem.owned import locked
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
 from softgrasp.fem.run.interrupt import interruptible
@@ -300,14 +301,22 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
         SolverError: a solve failed or missed its tolerance.
         ResourceError: the snapshots do not fit.
         CheckpointError: resume was asked for and no fitting restart file is there.
-        Interrupted: Ctrl-C or ``until``; the message names the restart file.
+        Interrupted: Ctrl-C or SIGTERM; Paused: ``until``; the message names the restart file.
+        SceneError: another run holds the folder into which this one would write.
 
     >>> import softgrasp as sg
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=60"])
     >>> sg.simulate(model).energy_drift < 1e-12
     True
     """
-    options = options or RunOptions()
+    options, kept = options or RunOptions(), model.scene.output
+    if kept.snapshots != "hdf5" and not (kept.checkpoint_every or options.resume or options.until is not None):
+        return _simulate(model, options, force)
+    with locked(model.system.layout.comm, options.directory):
+        return _simulate(model, options, force)
+
+
+def _simulate(model: Model, options: RunOptions, force: Force | None) -> Trajectory:
     run = Run(model, options, force)
     ts = make_ts(run)
     try:
@@ -372,6 +381,6 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
             if full:
                 raise ResourceError(f"{full}; {manifest} lets --resume go on from step {run.reached}")
             if stopped or run.reached == last:
-                raise Interrupted(
+                raise (Interrupted if stopped else Paused)(
                     f"stopped after step {run.reached} of {run.steps}; {manifest} lets --resume go on from there"
                 )

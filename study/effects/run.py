@@ -34,6 +34,7 @@ from softgrasp.study.effects.verdict import (
 )
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Session, list_files
 
 TIMER = 0.03  # relative difference of two equal runs that cache and page placement can leave in every sample
@@ -133,6 +134,7 @@ def check_variants(scene: Scene, comm: MPI.Intracomm, explanation: Explanation, 
         )
 
 
+@folder_lock()
 def run_effects(
     path: Path, out: Path, overrides: list[str], console: Console, *, quiet: bool = False, empty: bool = False
 ) -> dict[str, Any]:

@@ -16,12 +16,14 @@ from softgrasp.study.forward.explain import EffectReport, Explanation, MeshRepor
 from softgrasp.study.report.origin import origin
 from softgrasp.study.report.page import EQUATION, Section
 from softgrasp.study.report.tables import Table, listed, percent
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Page, Session, list_files
 
 EFFECTS = ("effect", "verdict", "gate", "number", "matters from", "what it says")
 COSTS = ("effect", "adds", "allocates", "cost")
 
 
+@folder_lock()
 def run_explain(
     path: Path, out: Path | None, overrides: Sequence[str], console: Console, *, empty: bool = False
 ) -> Explanation:

@@ -16,6 +16,8 @@ from typing import Any
 
 from mpi4py import MPI
 
+from softgrasp.fem.owned import note
+
 Draw = Callable[[Path], list[Path]]
 
 
@@ -57,6 +59,7 @@ def draw_in_background(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[
             raise done
         out.mkdir(parents=True, exist_ok=True)
         with folder:
+            note(*(out / file.name for file in done))
             return [Path(shutil.move(file, out / file.name)) for file in done]
 
     return files

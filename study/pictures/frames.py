@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
 from softgrasp.fem.fields.series import SeriesWriter
 from softgrasp.fem.fields.vtu import note_of
 from softgrasp.fem.model.build import Model
+from softgrasp.fem.owned import remove_own
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import Run, frame_steps
 from softgrasp.fem.run.trajectory import Trajectory
@@ -70,8 +70,7 @@ class Frames:
             if path.stem in own and note_of(path) == run.name:
                 continue
             self.foreign = self.foreign or path.stem in own
-            shutil.rmtree(path.with_suffix(""), ignore_errors=True)
-            path.unlink()
+            remove_own(self.directory, path.with_suffix(""), path)
 
     def _load(self, run: Run) -> None:
         frames = [

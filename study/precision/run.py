@@ -10,7 +10,7 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.progress import TaskProgressColumn
 
-from softgrasp.fem.accuracy.adapt import build_to_tolerance
+from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.errors import ResourceError, SceneError, SolverError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.refined import scene_ends
@@ -32,11 +32,13 @@ from softgrasp.study.precision.result import Answer, ErrorBudget, Question, Refe
 from softgrasp.study.precision.riccati import ControlRuns, ask_reduced_riccati, ask_riccati, settings_of
 from softgrasp.study.precision.settings import own_setting, variant
 from softgrasp.study.reduce.measure import chosen_methods
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Session
 
 FULL_SNAPSHOTS = 3e8  # entries; beyond them the scene's own run is too large for reduced models in memory
 
 
+@folder_lock()
 def run_study(
     path: Path,
     out: Path,
@@ -94,7 +96,7 @@ def study_scene(
     """
     request = request or Request()
     names = request.questions
-    model = build_to_tolerance(variant(scene, own_setting(scene)), comm)
+    model = adapt.build(variant(scene, own_setting(scene)), comm=comm)
     store = Cache(cache, comm, scene, progress)
     runs = FullRuns(scene, find_places(scene, model), model.system.layout.reference, store)
     control = ControlRuns(model, store, request.names)

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from softgrasp.fem.errors import SceneError, agree
 from softgrasp.fem.model.build import Model, Stopwatch, build
+from softgrasp.fem.owned import follow
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.file import load_scene_collective
@@ -25,13 +26,14 @@ from softgrasp.study.query.page import box_text, write_page
 from softgrasp.study.query.request import drive_of, materials_of, parse_settings, read_batch
 from softgrasp.study.report.origin import command_line
 from softgrasp.study.report.tables import pairs
-from softgrasp.study.shell.folder import claim
+from softgrasp.study.shell.folder import claim, folder_lock
 from softgrasp.study.shell.session import list_files, show_warnings
 
 REFUSED = 3  # exit status
 SHOWN = 20  # lines of a batch in the terminal
 
 
+@folder_lock()
 def run_query(
     path: Path,
     console: Console,
@@ -81,7 +83,10 @@ def run_query(
     drive = drive_of(model, motion, dt)
     with agree(MPI.COMM_WORLD):
         if folder is not None and MPI.COMM_WORLD.rank == 0:
-            claim(folder, "query", model.fine.name, path=path, empty=empty)
+            read = [file for file in (path, motion, scene, batch) if file is not None]
+            claim(folder, "query", model.fine.name, inputs=read, empty=empty)
+    if folder is not None:
+        follow(folder)
     modes = f"{model.k} modes" + (f", certified by {model.k2}" if model.k < model.k2 else "")
     trained = "" if model.box is None else f", trained for {box_text(model.box)}"
     limit = "" if model.tolerance is None else f", tolerance {model.tolerance:g}"

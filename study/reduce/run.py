@@ -20,6 +20,7 @@ from softgrasp.study.reduce.findings import findings
 from softgrasp.study.reduce.result import N_NOTE, FullTimes, ReductionStudy, best
 from softgrasp.study.reduce.views import gather_views
 from softgrasp.study.report.tables import Table
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Flags, Page, Session, list_files
 
 
@@ -38,6 +39,7 @@ def check_scene(scene: Scene) -> tuple[str, ...]:
     return measure.chosen_methods(scene.reduction)
 
 
+@folder_lock()
 def run_reduce(
     path: Path,
     out: Path,

@@ -14,6 +14,7 @@ import rich.table
 from rich.console import Console
 from rich.markup import escape
 
+from softgrasp.fem.owned import note
 from softgrasp.study.report.page import NUMBERS, Section, cell_text
 
 Columns = Mapping[str, str | Callable[[Any], Any]]
@@ -39,6 +40,7 @@ class Table:
 
     def write_csv(self, path: Path) -> Path:
         """One line a row, numbers in full, nothing for None. Not collective: call on one rank."""
+        note(path)
         with path.open("w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(self.header)
