@@ -19,7 +19,7 @@ from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import Target, hand_target, rest
 from softgrasp.lqr.reduced.riccati import GainCheck
-from softgrasp.lqr.riccati import Method, choose, modal_lqr, solve
+from softgrasp.lqr.riccati import Spelling, choose, modal_lqr, solve
 from softgrasp.lqr.spectrum.modal_loop import LoopQuality
 from softgrasp.lqr.spectrum.sampled import Sampling
 
@@ -125,7 +125,7 @@ def _modal(plant: RiccatiProblem, diagnosis: Diagnosis) -> RiccatiSolution:
 
 def _solve(model: Model, plant: RiccatiProblem, progress: Progress | None, checkpoint: Path | None) -> RiccatiSolution:
     control = control_of(model)
-    method = cast(Method, control.method.replace("-", "_"))
+    method = cast(Spelling, control.method)
     tol = None
     # galerkin measures the change of its gain, not the residual
     if "tolerance" in control.model_fields_set and choose(plant, method).method != "galerkin":

@@ -147,6 +147,12 @@ def gain_error(problem: RiccatiProblem, gain: Gain, gain_hat: Gain) -> float:
     return norm(problem, difference) / norm(problem, gain_to_absolute(system, K))
 
 
+def tissue_gain_error(problem: RiccatiProblem, gain: Gain, gain_hat: Gain) -> float:
+    """The same of the tissue's rows alone, beside which those of a heavy hand are large. Collective."""
+    K, K_hat, none = gain.block, gain_hat.block, np.zeros((0, len(gain.K_s)))
+    return norm(problem, Block(none, K.tall - K_hat.tall)) / (norm(problem, Block(none, K.tall)) or 1.0)
+
+
 class GainCheck:
     """Compares reduced gains with the optimal one on the full plant.
 

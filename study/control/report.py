@@ -12,9 +12,9 @@ from softgrasp.fem.columns import hand_columns
 from softgrasp.lqr.design.feedback import Design, running_words
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.margins import LoopMargins
-from softgrasp.lqr.plant.problem import rigid_gains
+from softgrasp.lqr.plant.problem import RiccatiSolution, rigid_gains
 from softgrasp.lqr.reduced.riccati import GainQuality
-from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, radius_of, settled
+from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, gain_change, radius_of, settled
 from softgrasp.study.forward.result import trajectory_header
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation import control_equation
@@ -56,6 +56,7 @@ def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[st
         ("method", solution.summary),
         ("rank, Newton steps, solves", ", ".join(counts)),
         ("true relative residual", f"{solution.residual:.1e}"),
+        *_settled_gain(solution),
         ("optimal cost from the start", f"{study.design.gain_check.optimal:.6g}"),
         *_spectrum(study.design),
         ("gain, body displaced", displaced),
@@ -90,10 +91,24 @@ def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[st
     return rows
 
 
+def _settled_gain(solution: RiccatiSolution) -> list[tuple[str, str]]:
+    """Of a Galerkin gain the changes between the last two spaces: its residual says little of the gain."""
+    change = gain_change(solution)
+    text = change and f"rows of the hand {change['hand']:.1e}, of the tissue {change['tissue']:.1e}"
+    return [("last change of the gain", text)] if text else []
+
+
 def summary(study: GainStudy) -> list[str]:
     """What came out, in three sentences."""
     design, optimal = study.design, study.design.gain_check.optimal
-    first = f"The Riccati equation is solved to the relative residual {design.solution.residual:.1e}."
+    first, solved = f"The Riccati equation is solved to the relative residual {design.solution.residual:.1e}.", ""
+    change = gain_change(design.solution)
+    if change is not None:
+        first = solved = (
+            f"The Riccati equation is solved by a Galerkin method: its true relative residual is "
+            f"{design.solution.residual:.1e}; between the last two spaces the gain changed by {change['hand']:.1e} in "
+            f"the rows of the hand and by {change['tissue']:.1e} in those of the tissue."
+        )
     cost = f"The move costs {optimal:.4g} at least; the abscissa of its loop is {design.quality.abscissa:.3g} 1/s."
     if isinstance(study, ControlStudy):
         full = study.loops.full
@@ -101,7 +116,7 @@ def summary(study: GainStudy) -> list[str]:
         reaches = "does not settle within 1 % of the way in this run" if arrived is None else (
             f"reaches the target, within 1 % of the way, in {arrived:.3g} s"
         )  # fmt: skip
-        first = f"The optimal gain {reaches}."
+        first = f"The optimal gain {reaches}. {solved}".rstrip()
         cost = f"The move costs {paid:.4g}; the Riccati equation predicts {optimal:.4g}."
         if full.saturated:
             excess = (paid + study.loops.to_come) / optimal - 1

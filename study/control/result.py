@@ -17,7 +17,7 @@ from softgrasp.lqr.design.feedback import Design, running_words
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
-from softgrasp.lqr.plant.problem import rigid_gains, translation_defect, velocity_defect
+from softgrasp.lqr.plant.problem import RiccatiSolution, rigid_gains, translation_defect, velocity_defect
 from softgrasp.lqr.plant.target import Target
 from softgrasp.lqr.reduced.retune import RetunedGain
 from softgrasp.lqr.reduced.riccati import GainQuality
@@ -138,6 +138,7 @@ class GainStudy:
             "rank": solution.rank,
             **{key: solution.counts.get(key, 0) for key in ("newton_steps", "adi_steps", "solves")},
             "residual": solution.residual,
+            "gain_change": gain_change(solution),
             "optimal_cost": d.gain_check.optimal,
             "gain_translation": displaced.tolist(),
             "gain_rigid_velocity": moving.tolist(),
@@ -179,6 +180,12 @@ class ControlStudy(GainStudy):
             "loop": _loop(self),
             **({} if self.finite is None else {"finite_strain": _finite(self.finite)}),
         }
+
+
+def gain_change(solution: RiccatiSolution) -> dict[str, float] | None:
+    """How much hand's and tissue's rows of a Galerkin gain changed between its last two spaces; else None."""
+    last = solution.history[-1] if solution.method == "galerkin" else None
+    return last and {key: last[f"change_{key}"] for key in ("hand", "tissue")}
 
 
 def report_dict(gain: GainQuality, keys: Sequence[str] = REPORT) -> dict[str, Any]:

@@ -122,11 +122,13 @@ def test_reduced_gains_stay_below_their_bound() -> None:
     ran = np.array([gap.excess for gap in gaps])
     assert ran == pytest.approx(excess, rel=1e-2)  # what is to come after 300 s
     assert (bounds >= excess).all(), bounds / excess
-    assert bounds[0] <= 1.1 * excess[0], bounds / excess  # what is to come after 300 s, once more
+    # what is to come after 300 s, five times; a fifth of what the last half lost is less
+    room = np.array([5.1 * gap.to_come / gap.least for gap in gaps])
+    assert (bounds <= 1.001 * excess + room).all(), bounds / excess
     longer = duality_gaps(problem, gains, Course(start, 0.5, 1200), solution)
     bounds = np.array([gap.cost_excess_at_most for gap in longer])
     assert (bounds >= excess * (1 - 1e-6)).all(), bounds / excess  # rounding of the Lyapunov equation
-    assert (bounds[:2] <= [1.001 * excess[0], 2 * excess[1]]).all(), bounds / excess  # sharp, as little is to come
+    assert (bounds[:2] <= [1.003 * excess[0], 3 * excess[1]]).all(), bounds / excess  # sharp, as little is to come
 
 
 def test_a_run_that_starts_at_its_target_costs_nothing_and_bounds_nothing() -> None:
