@@ -1,0 +1,149 @@
+"""A small model from static solves that follows the outputs of a scene's own run.
+
+    V = span{X, K^-1 M X, (K^-1 M)^2 X, ..},   X = K_ee^-1 [G, C'],
+
+matches the moments of C (K + s^2 M)^-1 G about s = 0 [B02], twice as many as it has blocks because both sides are in X.
+What is driven slower than the first neglected frequency it follows to the accuracy of the static solves, which is what
+the difference between two meshes needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.outputs import make_outputs, output_columns
+from softgrasp.fem.petsc import Array, normalising, times_columns, total
+from softgrasp.fem.run.motion import force_values, free_table
+from softgrasp.fem.solve.stiffness import factored_stiffness
+
+BLOCKS = 4
+DROPPED = 1e-12  # of the squared length before the projection: directions that are rounding only, or known already
+
+Solve = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class KrylovModel:
+    """M xi'' + D xi' + K xi = G c, z = V xi, of a model; small arrays on every rank."""
+
+    V: Array  # basis, local rows (n_local, N), with V' K V = 1
+    # M, D: projected mass and damping (N, N)
+    M: Array
+    D: Array
+    G: Array  # coupling (N, n_s)
+    C: Array  # outputs of the tissue against the hand (p, N)
+    C_s: Array  # their rigid part (p, n_s)
+    # static solutions K_ee^-1 [G, C'], local rows (n_local, n_s + p); columns of outputs that are none are zero
+    X: Array
+    model: Model  # whose it is
+
+    @cached_property
+    def run(self) -> KrylovRun:
+        """The run of the scene, see :func:`run_krylov`."""
+        return run_krylov(self)
+
+    @cached_property
+    def modes(self) -> tuple[Array, Array]:
+        """Ritz frequencies omega (N,), ascending [1/s], and modes (N, N) with Phi' M Phi = 1."""
+        squares, Phi = scipy.linalg.eigh(np.eye(len(self.M)), self.M)
+        return np.sqrt(squares), Phi
+
+
+@contextmanager
+def static_solves(model: Model) -> Iterator[Solve]:
+    """What applies K_ee^-1 to columns, factored once. Collective."""
+    with factored_stiffness(model.system, rtol=min(model.scene.time.rtol, 1e-10)) as solver:
+        yield solver.columns
+
+
+def krylov_model(model: Model) -> KrylovModel:
+    """The small model of a model, with `BLOCKS` static solves of each column. Collective.
+
+    A mesh with fewer unknowns than columns ends in a basis of its whole space, where the small model is the full one.
+    """
+    system, comm = model.system, model.system.layout.comm
+    outputs = make_outputs(model.scene, system)
+    C = output_columns(outputs, system.layout.n_local)
+    V = K_V = np.zeros((len(C), 0))
+    with static_solves(model) as solve:
+        last = X = solve(np.hstack([system.G, C]))
+        for k in range(BLOCKS):
+            if k:
+                last = solve(times_columns(system.M_ee, last))
+            for _ in range(2):  # once is not enough where blocks are nearly dependent
+                K_last = times_columns(system.K_ee, last)
+                lengths = total(comm, np.einsum("ij,ij->j", last, K_last))
+                known = total(comm, V.T @ K_last)
+                last, K_last = last - V @ known, K_last - K_V @ known
+                gram = total(comm, last.T @ K_last)
+                scale = np.sqrt(np.maximum(lengths, 1e-300))
+                Q = comm.bcast(normalising((gram + gram.T) / 2 / np.outer(scale, scale), 0.0, DROPPED) / scale[:, None])
+                last, K_last = last @ Q, K_last @ Q
+            V, K_V = np.hstack([V, last]), np.hstack([K_V, K_last])
+    damping = system.damping
+    M = total(comm, V.T @ times_columns(system.M_ee, V))
+    D = damping.alpha * M + damping.beta * np.eye(len(M))
+    if damping.matrix is not None:
+        D = damping.alpha * M + total(comm, V.T @ times_columns(damping.matrix, V))
+    C_s = np.vstack([o.C_s for o in outputs])
+    pair = total(comm, V.T @ np.hstack([system.G, C]))
+    n_s = system.layout.n_s
+    return KrylovModel(V, (M + M.T) / 2, (D + D.T) / 2, pair[:, :n_s], pair[:, n_s:].T, C_s, X, model)
+
+
+@dataclass(frozen=True)
+class KrylovRun:
+    """A run of a small model."""
+
+    deformation: Array  # outputs against the hand, (steps + 1, p)
+    rigid: Array  # their rigid part, (steps + 1, p)
+    loads: Array  # c of each step, (steps, n_s)
+    accelerations: Array  # xi'' at the middle of each step, (steps, N)
+
+
+def run_krylov(small: KrylovModel, steps: int | None = None) -> KrylovRun:
+    """Run the scene's motion or force with the midpoint rule, as the full model does.
+
+    Raises SceneError: a CSV file of the motion does not fit.
+    """
+    system, scene = small.model.system, small.model.scene
+    n = steps or scene.time.steps
+    scene = scene.model_copy(update={"time": scene.time.model_copy(update={"steps": n})})
+    dt, g, alpha = scene.time_end / n, system.fall, system.damping.drag
+    z = small.G @ g if scene.time.start == "equilibrium" else np.zeros(len(small.M))  # V' K V = 1
+    if scene.motion.drive == "force" and system.two_way:  # hand and tissue together
+        G, R, n_s = small.G, system.M_rigid, len(g)
+        M = np.block([[system.M_hand + R, G.T], [G, small.M]])
+        D = np.block([[alpha * R, alpha * G.T], [alpha * G, small.D]])
+        K = np.diag(np.repeat([0.0, 1.0], [n_s, len(z)]))
+        B = np.block([[np.eye(n_s), R], [np.zeros_like(G), G]])
+        u = force_values(scene, n_s, system.M_hand) + system.weight
+        X, a = _midpoint(M, D, K, B, np.hstack([u, np.tile(g, (n, 1))]), np.append(np.zeros(n_s), z), dt)
+        q, Z, accelerations = X[:, :n_s], X[:, n_s:], a[:, n_s:]
+        loads = g - a[:, :n_s] - alpha * np.diff(q, axis=0) / dt
+    else:
+        table, _ = free_table(system, scene, dt)
+        q, loads = table.q, g - table.a - alpha * (table.v[1:] + table.v[:-1]) / 2
+        Z, accelerations = _midpoint(small.M, small.D, np.eye(len(z)), small.G, loads, z, dt)
+    return KrylovRun(Z @ small.C.T, q @ small.C_s.T, loads, accelerations)
+
+
+def _midpoint(M: Array, D: Array, K: Array, B: Array, f: Array, x: Array, dt: float) -> tuple[Array, Array]:
+    """M x'' + D x' + K x = B f from rest at x, f in the middle of the steps, (n, k): x (n + 1, N) and x'' (n, N)."""
+    n, s = len(f), 2 / dt
+    inverse = np.linalg.inv(K + s * D + s * s * M)
+    half = np.hstack([-inverse @ K, s * s * inverse @ M])  # w = x_mid - x_n from x_n and u_n = x'_n / s
+    T = np.vstack([2 * half, 2 * half]) + np.diag(np.repeat([1.0, -1.0], len(x)))  # u_{n+1} = 2 w - u_n
+    Y = np.empty((n + 1, 2 * len(x)))
+    Y[0, : len(x)], Y[0, len(x) :] = x, 0.0
+    Y[1:] = np.tile(2 * f @ (inverse @ B).T, 2)
+    for i in range(n):
+        Y[i + 1] += T @ Y[i]
+    return Y[:, : len(x)], s * s * np.diff(Y[:, len(x) :], axis=0) / 2

@@ -1,0 +1,96 @@
+"""The operators of a step on the rows that a rank computes: its own, or all of them in the order of elimination."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softgrasp.fem.errors import agree
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array, PETSc, rows_on_all, whole_copy
+from softgrasp.fem.solve.cholesky import NodeOrder, dissect
+from softgrasp.fem.system import BlockSystem
+
+
+@dataclass(frozen=True)
+class ReplicatedOperators:
+    """Stiffness, damping matrix and coupling as one rank steps them."""
+
+    layout: BlockLayout
+    whole: bool  # all rows are here, on a communicator of this rank alone
+    order: NodeOrder | None  # of the rows here; None: that of the layout
+    rows: slice | NDArray[np.intp]  # places of the owned rows among those here
+    K: PETSc.Mat  # stiffness, a copy, in blocks of d x d on one rank: a quarter less memory traffic than single entries
+    G: Array  # coupling to the hand, (rows here, n_s)
+    S: PETSc.Mat  # matrix of the step; whoever factors it owns it
+    D: PETSc.Mat | None
+    M: PETSc.Mat | None  # mass, only beside D
+    parts: tuple[PETSc.Mat, ...] = ()  # further matrices that were asked for, on the same rows; whoever asked owns them
+
+    def agree(self) -> AbstractContextManager[None]:
+        """Guard of a block that is a rank's own affair when it has all rows, and collective otherwise. Collective.
+
+        The block must not communicate by itself.
+        """
+        return agree(self.layout.comm) if self.whole else nullcontext()
+
+    def gather(self, local: Array) -> Array:
+        """Rows here of a vector given by its owned rows. Collective."""
+        return self.enter(rows_on_all(self.layout.comm, local)) if self.whole else local
+
+    def enter(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Rows in the order of the layout as they lie here."""
+        return x if self.order is None else self.order.enter(x)
+
+    def leave(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Rows here in the order of the layout."""
+        return x if self.order is None else self.order.leave(x)
+
+    def destroy(self) -> None:
+        """Free what is not the system's own. Collective."""
+        self.K.destroy()
+        if self.whole:
+            for A in (self.D, self.M):
+                if A is not None:
+                    A.destroy()
+
+
+def replicated_operators(
+    system: BlockSystem, S: PETSc.Mat, whole: bool, ordered: bool, parts: tuple[PETSc.Mat, ...] = ()
+) -> ReplicatedOperators:
+    """Operators of a system on the owned rows, or on all. Collective.
+
+    Args:
+        S: matrix of the step, consumed.
+        ordered: in the order of elimination; all rows then.
+    """
+    layout, D = system.layout, system.damping.matrix
+    beside = () if D is None else (D, system.M_ee)
+    first, last = layout.start, layout.start + layout.n_local
+    if not (whole or ordered):
+        K = system.K_ee.copy()
+        if K.comm.size == 1:  # the conversion of a parallel matrix takes its source apart
+            K.convert("baij")
+        G, M = np.asfortranarray(system.G), None if D is None else system.M_ee
+        return ReplicatedOperators(layout, False, None, slice(0, layout.n_local), K, G, S, D, M, parts)
+    every = [whole_copy(A) for A in (system.K_ee, S, *beside, *parts)]
+    for A in (S, *parts):
+        A.destroy()
+    G, order = rows_on_all(layout.comm, system.G), None
+    rows: slice | NDArray[np.intp] = slice(first, last)
+    if ordered:
+        dissection = dissect(every[0], layout.dimension)
+        for i, A in enumerate(every):
+            every[i] = dissection.matrix(A)
+            A.destroy()
+        order = dissection.order
+        G, rows = order.enter(G), order.rows_of(first, last)
+    else:
+        every[0].convert("baij")
+    K, S, *rest = every
+    D, M = rest[: len(beside)] or (None, None)
+    return ReplicatedOperators(layout, True, order, rows, K, np.asfortranarray(G), S, D, M, tuple(rest[len(beside) :]))

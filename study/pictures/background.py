@@ -1,0 +1,76 @@
+"""Pictures drawn by a forked process while this one goes on computing."""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+import shutil
+import signal
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from mpi4py import MPI
+
+from softgrasp.fem.owned import note
+
+Draw = Callable[[Path], list[Path]]
+
+
+def draw_in_background(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[], list[Path]]:
+    """Begin to draw into ``out``; the function returned waits for the files and names them on rank 0. Not collective.
+
+    What is drawn must be on this rank already: the process has all of it by fork, nothing is copied or packed, and only
+    the names come back. Several ranks have the cores taken, and their network may not bear a fork: with them, on one
+    core and where no process can be started, the pictures are drawn when they are asked for.
+
+    Raises (when they are asked for):
+        Exception: what ``draw`` raised.
+    """
+    if comm.rank != 0:
+        return list
+    if comm.size > 1 or len(os.sched_getaffinity(0)) < 2:
+        return partial(draw, out)
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    folder = TemporaryDirectory(prefix="softgrasp-")
+    process = context.Process(target=_send, args=(sender, draw, Path(folder.name)), daemon=True)
+    try:
+        with warnings.catch_warnings():  # of threads that hold locks: the child takes none of theirs
+            warnings.simplefilter("ignore", DeprecationWarning)
+            process.start()
+    except OSError:
+        return partial(draw, out)
+    sender.close()
+
+    def files() -> list[Path]:
+        try:
+            done = receiver.recv()
+        except EOFError:  # killed, for want of memory
+            done = OSError()
+        process.join()
+        if isinstance(done, OSError):  # perhaps there is room in the folder itself
+            return draw(out)
+        if isinstance(done, Exception):
+            raise done
+        out.mkdir(parents=True, exist_ok=True)
+        with folder:
+            note(*(out / file.name for file in done))
+            return [Path(shutil.move(file, out / file.name)) for file in done]
+
+    return files
+
+
+def _send(sender: Any, draw: Draw, folder: Path) -> None:
+    """Draw in the child, and send the names or the error; Ctrl-C ends it at once."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
+    gc.disable()  # what belongs to PETSc and MPI is not this process's to free
+    try:
+        sender.send(draw(folder))
+    except Exception as error:
+        sender.send(error)

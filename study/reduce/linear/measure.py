@@ -1,0 +1,241 @@
+"""Every basis at every N against the full run, and the best of them over the box: errors, times, stability."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from functools import partial
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.scene.control import Reduction
+from softgrasp.reduction.bases import registry
+from softgrasp.reduction.bases.basis import Basis
+from softgrasp.reduction.bases.states import BasisError, States, states_of
+from softgrasp.reduction.bases.truncation import Truncation
+from softgrasp.reduction.errors import ModelComparison
+from softgrasp.reduction.model import ModelError, ReducedModel
+from softgrasp.reduction.online import run
+from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
+from softgrasp.reduction.reduce import project_scene
+from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
+from softgrasp.study.reduce.linear.result import (
+    COMPARED,
+    LARGER,
+    BoxErrors,
+    BoxPoint,
+    BoxTests,
+    MethodSweep,
+    Point,
+    TestedModel,
+    by_error,
+    kept_points,
+    nearest,
+    timed_points,
+)
+from softgrasp.study.reduce.times import FullTimes, Say
+from softgrasp.study.shell.timing import median_seconds
+
+FURTHER = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
+REPEATS, SETUPS = 15, 7  # behind each median of the online time and of the set-up
+METHODS_TESTED = 4  # over the box
+PAPER_FULL, PAPER_REDUCED = 16.22, 0.097  # seconds of [SBRH21]: 2n = 1916, 600 steps, and PSD at N = 14
+LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
+
+Progress = Callable[[int, int], None]
+"""Called with what is done and what there is."""
+
+
+def chosen_methods(options: Reduction) -> tuple[str, ...]:
+    """Methods of the scene, or the paper's six and further ones. Raises BasisError: a name is unknown."""
+    names = tuple(options.methods) or (*registry.PAPER_METHODS, *FURTHER)
+    for name in names:
+        registry.find_method(name)
+    return names
+
+
+def bases_of(
+    name: str, states: States, sizes: list[int], options: Reduction, refused: dict[int, str]
+) -> tuple[tuple[Basis, ...], int | None]:
+    """Bases at all sizes that the snapshots carry, and the columns that keep the scene's share of the energy.
+
+    What does not fit is put into ``refused`` by its N, with the reason. Collective.
+    """
+    method, n_s = registry.METHODS[name], states.system.layout.n_s
+    inner = None if options.inner == "auto" or not method.snapshots else options.inner
+    rule = [Truncation(energy=options.energy)] if method.snapshots else []
+    refused |= registry.impossible_sizes(method, n_s, sizes)
+    sizes = registry.possible_sizes(method, n_s, sizes)
+    while sizes or rule:
+        try:
+            bases = registry.make_bases(name, states, [*sizes, *rule], inner, options.engine)
+        except BasisError as error:
+            most = error.most
+            larger = [N for N in sizes if most is not None and most < N]
+            if not larger and rule:
+                rule = []  # it may be the share that fails; what fails in general fails again
+                continue
+            limit = "the snapshots carry above rounding" if method.snapshots else "this mesh has modes for"
+            reason = f"more than {limit}; ask for N <= {most}" if larger else error.reason
+            refused |= dict.fromkeys(larger or sizes, reason)
+            sizes = [N for N in sizes if larger and N not in larger]
+        else:
+            return bases[: len(sizes)], bases[-1].N if rule else None
+    return (), None
+
+
+def measured(
+    bases: Sequence[Basis], full: FullRun, refused: dict[int, str], progress: Progress = lambda done, of: None
+) -> Iterator[tuple[ReducedModel, Point]]:
+    """Models of nested bases with their errors and times; one without a run is put into ``refused``. Collective."""
+    if not bases:
+        return
+    outputs = full.model.outputs
+    # smaller bases are leading columns of the largest: one factorisation gives the errors of all
+    comparison = comparison_of(project_scene(bases[-1], full.model, outputs), full)
+    for i, basis in enumerate(bases):
+        progress(i, len(bases))
+        model = project_scene(basis, full.model, outputs)
+        try:
+            point = measure(model, full, comparison)
+        except ModelError as error:
+            refused[basis.N] = error.reason
+        else:
+            yield model, point
+
+
+def measure(model: ReducedModel, full: FullRun, comparison: ModelComparison) -> Point:
+    """Run one reduced model at the scene's own parameter and compare. Collective.
+
+    ``comparison``: of the largest model of the family. Raises ModelError: E or A is singular, so that the model has no
+    run or no equilibrium to start in.
+    """
+    layout = full.model.system.layout
+    with np.errstate(all="ignore"):  # an unstable model may overflow, and is marked
+        small = model.at()
+        step, drive = replay_inputs(model, small, full)
+        errors = comparison.errors(model, small, run(step, allow_unstable=True, **drive))
+        setup = median_seconds(layout.comm, lambda: replay_inputs(model, model.at(), full)[0].stable, SETUPS)
+        online = median_seconds(layout.comm, lambda: run(step, allow_unstable=True, **drive), REPEATS)
+    return Point(
+        N=model.N,
+        N_tissue=model.N - (2 * layout.n_s if model.fixed_solid else 0),
+        split=model.split,
+        **asdict(errors),
+        projection_error_deformation=comparison.projection_error("deformation", model, small),
+        projection_error=comparison.projection_error("velocities", model, small),
+        time_offline=float(layout.comm.allreduce(sum(model.seconds.values()), MPI.MAX)),
+        time_setup=setup,
+        time_online=online,
+        spectral_abscissa=small.spectral_abscissa,
+        stable=small.stable,
+    )
+
+
+def sweep(name: str, full: FullRun, options: Reduction, progress: Progress = lambda done, of: None) -> MethodSweep:
+    """One method at all its N. Collective. Raises SolverError: a factorisation failed."""
+    refused: dict[int, str] = {}
+    bases, kept = bases_of(name, states_of(full.model.system, full.snapshots), options.N, options, refused)
+    points: list[Point] = []
+    models: dict[int, ReducedModel] = {}
+    for model, point in measured(bases, full, refused, progress):
+        points.append(point)
+        models[model.N] = model
+        models = {N: models[N] for N in models if N in kept_points(points)}
+    sigma, inner = (bases[0].sigma, bases[0].inner) if bases else ((), "")
+    about = dict(sorted(refused.items())), kept, inner
+    return MethodSweep(registry.METHODS[name], tuple(points), models, sigma, *about)
+
+
+def sweep_all(names: Sequence[str], full: FullRun, say: Say) -> tuple[MethodSweep, ...]:
+    """Every method at all N of the scene. Collective."""
+    options = full.model.scene.reduction
+    size = len(options.N)
+
+    def swept(i: int, done: int, of: int) -> None:
+        say(names[i], size * i + size * done // of, size * len(names))
+
+    return tuple(sweep(name, full, options, partial(swept, i)) for i, name in enumerate(names))
+
+
+def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | None) -> list[TestedModel]:
+    """Models of the best methods at two N: those of the sweep, and from ``states`` with the same N. Collective."""
+    outputs, models = full.model.outputs, []
+    for s, _ in by_error(sweeps)[:METHODS_TESTED]:
+        sizes = {p.N for N in (COMPARED, LARGER) if (p := nearest(s.points, N)) is not None}
+        own = [s.models[N] for N in sorted(sizes)]
+        models += [TestedModel(s.method, False, model) for model in own]
+        if states is None or not s.method.snapshots:
+            continue
+        bases, _ = bases_of(s.method.key, states, [model.N for model in own], full.model.scene.reduction, {})
+        several = [project_scene(b, full.model, outputs) for b, _ in zip(bases, own, strict=False)]
+        models += [TestedModel(s.method, True, model) for model in several]
+    return models
+
+
+def errors_at(full: FullRun, models: Sequence[TestedModel]) -> tuple[float, ...]:
+    """Deformation errors of all models at the parameter of one full run, without any new projection. Collective."""
+    largest = {(m.method.key, m.several): m.model for m in sorted(models, key=lambda m: m.model.N)}
+    comparisons = {family: comparison_of(model, full) for family, model in largest.items()}
+    errors = []
+    for m in models:
+        with np.errstate(all="ignore"):  # may be unstable away from the training parameter
+            reduced = replay_linear(m.model, full.model, full, allow_unstable=True)
+            small, comparison = m.model.at(full.model.system.materials), comparisons[m.method.key, m.several]
+            errors.append(comparison.state_error("deformation", m.model, small, reduced))
+    return tuple(errors)
+
+
+def measure_box(full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress = lambda done, of: None) -> BoxTests:
+    """Train, and test over the box. Collective. Raises SolverError: a run failed. ResourceError: no memory."""
+    scene = full.model
+    reason = outside(scene) or ("" if by_error(sweeps) else "no method has a stable model")
+    if reason:
+        return BoxTests(none=reason)
+    first, training, grid = scene.system.materials[0], training_of(scene), grid_of(scene)
+    models = box_models(full, sweeps, training_states(full, training) if training else None)
+    trained_at = ((first.lam, first.mu), *training)
+    points = []
+    for k, (lam, mu) in enumerate(grid):
+        progress(k, len(grid))
+        trained = any(np.allclose((lam, mu), place) for place in trained_at)
+        points.append(BoxPoint(lam, mu, trained, errors_at(run_at(scene, lam, mu), models)))
+    own, tests, summary = errors_at(full, models), [p for p in points if not p.trained] or points, []
+    for i, m in enumerate(models):
+        errors = [p.errors[i] for p in tests]
+        runs = len(trained_at) if m.several else int(m.method.snapshots)
+        largest = max(errors, key=lambda e: (not np.isfinite(e), e))
+        summary.append(BoxErrors(m.method.key, m.model.N, runs, own[i], statistics.median(errors), largest))
+    return BoxTests(tuple(models), tuple(points), tuple(summary), trained_at if training else (), box_of(scene))
+
+
+def speed_notes(n_e: int, steps: int, full: FullTimes, sweeps: Sequence[MethodSweep]) -> tuple[str, ...]:
+    """What the speed-up is measured against, the mesh that pays, and the paper's figure beside ours."""
+    against = (
+        f"Full model, prefactored: {steps} steps in {1e3 * full.steps:.1f} ms; its factorisation takes "
+        f"{1e3 * full.factor:.1f} ms. new: a new parameter, small matrices, test of stability and propagator with the "
+        "run. x again: steps of the full model over a run of the same small model again, all made beforehand on both "
+        "sides. x new: factorisation and steps over new. Break-even runs = offline / (full - new), at new parameters; "
+        "the full run that gives the snapshots is one more."
+    )
+    stable = [(method, p) for method, p in timed_points(sweeps) if p.stable]
+    if not stable:
+        return (against,)
+    method, p = next((chosen for chosen in stable if chosen[0].key == "psd"), stable[0])
+    # tissue unknowns at which a full run would take as long as a reduced one, at this mesh's time per unknown
+    mesh, model = n_e * p.time_online / full.steps, f"{method.title}, N = {p.N}"
+    if mesh < LEAST_MESH:
+        pays = f"the reduced run ({model}) is faster than a full run on every mesh"
+    else:
+        pays = f"a full run of n_e = {mesh:.0f} would take as long as the reduced one ({model})"
+    return (
+        against,
+        f"Break-even mesh: {pays}, at this mesh's time per unknown. The reduced time does not grow with the mesh, see "
+        "python -m benchmarks meshes.",
+        f"The paper reports {PAPER_FULL} s against {PAPER_REDUCED} s at 2n = 1916 and N = 14, a speed-up of "
+        f"{PAPER_FULL / PAPER_REDUCED:.0f}; here the same comparison, each side from its matrices on, gives "
+        f"{1e3 * (full.factor + full.steps):.1f} ms against {1e3 * (p.time_setup + p.time_online):.2f} ms, "
+        f"a speed-up of {full.against(p).new:.0f} for a new parameter ({model}).",
+    )

@@ -1,0 +1,145 @@
+"""Tables, sentences and page of ``softgrasp reduce`` at finite strain."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from softgrasp.study.reduce.strain.result import CELLS_AT, StrainFamily, StrainStudy
+from softgrasp.study.reduce.tables import TIMES, time_cells
+from softgrasp.study.report.page import Section, captioned
+from softgrasp.study.report.tables import Table
+
+CAPTIONS = {
+    "strain_errors.png": "Error of the deformation z against N, and against the number of sampled cells at some N. "
+    "Filled: over the runs that trained the models; open: largest of the held-out runs. Dotted: the same models on all "
+    "cells. Grey: linear elasticity on the same scene.",
+    "cells.png": "Cells that the models evaluate, and their weights: for how many cells of the body each of them is. "
+    "In 3D a dot stands for a cell.",
+}
+NOTE = (
+    "N counts the hand's 2 n_s, as for linear models. cells: those with a weight. own: error of z on the scene's own "
+    "run, which trained the model; estimate: what the model says of it by itself, from its residual in twice the "
+    "columns, no bound; energy: of (z, v) in the energy norm. all cells: error of z over the training runs without "
+    "sampling. new material, new motion: largest error of z on full runs inside the box that trained no model; "
+    "-: there are none, or the model refuses them. drift: of the model's own energy."
+)
+
+
+def sections(study: StrainStudy, files: Sequence[Path]) -> list[Section]:
+    """Parts of the page."""
+    held = [test_table(f).section(title=f"Held-out runs, models {f.title}") for f in study.families if f.tests]
+    return [
+        error_table(study).section(NOTE),
+        Section("What holds", text="\n\n".join(sentences(study))),
+        Section("", figures=captioned(files, CAPTIONS)),
+        time_table(study).section(),
+        cell_table(study).section(),
+        *held,
+    ]
+
+
+def error_table(study: StrainStudy) -> Table:
+    """One line for each family and N."""
+    header = ("runs", "N", "cells", "own", "estimate", "energy", "all cells", "new material", "new motion", "drift")
+    rows = [
+        (f.runs, p.N, p.cells, *map(_short, (p.error_own, p.estimate_own, p.error_own_energy_norm)),
+         _short(p.error_galerkin), *map(_short, (p.error_materials, p.error_motions)), f"{p.drift:.0e}")
+        for f in study.families for p in f.points
+    ]  # fmt: skip
+    return Table(header, rows, "Errors")
+
+
+def cell_table(study: StrainStudy) -> Table:
+    """Error against the number of cells where tau was varied."""
+    header = ("runs", "N", "tau", "cells", "own", "new material", "new motion", "run [ms]")
+    rows = [
+        (f.runs, p.N, _short(p.tau), p.cells, *map(_short, (p.error_own, p.error_materials, p.error_motions)),
+         f"{1e3 * p.time_online:.2f}")
+        for f in study.families
+        for p in sorted((p for p in f.curves if p.N in CELLS_AT), key=lambda p: (p.N, -p.tau))
+    ]  # fmt: skip
+    return Table(header, rows, "Cells")
+
+
+def time_table(study: StrainStudy) -> Table:
+    """Seconds and speed-ups, costs counted whole."""
+    rows = [(f.runs, p.N, p.cells, *time_cells(p, study.times)) for f in study.families for p in f.points]
+    return Table(("runs", "N", "cells", *TIMES), rows, "Times")
+
+
+def test_table(family: StrainFamily) -> Table:
+    """Every held-out run with a column for each N: the error, and its estimate in brackets."""
+    sizes = [p.N for p in family.points]
+    rows = [
+        (
+            t.kind,
+            f"{t.lam:.4g}",
+            f"{t.mu:.4g}",
+            ", ".join(f"{x:.3g}" for x in t.target),
+            *(f"{_short(t.errors[N])} ({_short(t.estimates[N])})" for N in sizes),
+        )
+        for t in family.tests
+    ]
+    return Table(("new", "lambda [Pa]", "mu [Pa]", "target [m]", *(f"N = {N}" for N in sizes)), rows)
+
+
+def _short(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1e}"
+
+
+def sentences(study: StrainStudy) -> list[str]:
+    """What the numbers say."""
+    full, points = study.full, study.full.model.system.points
+    law = "" if points is None else points.law
+    lines = [
+        f"Law: {law}. Linear elasticity misses the deformation of this scene by {100 * study.linear:.3g} %.",
+        f"Full model: {len(full.trajectory.times) - 1} steps in {study.times.steps:.3g} s, factorisation "
+        f"{1e3 * study.times.factor:.3g} ms. x again: its steps over a run of the same reduced model again. x new: "
+        "factorisation and steps over a new parameter with its run. offline: basis, model on all cells, forces and "
+        "weights; the full runs that train a model come on top.",
+    ]
+    for f in study.families:
+        lam, mu, load = f.box.lam[0], f.box.mu[0], np.abs(f.box.load).max(axis=1)
+        inside = f"lambda in [{lam[0]:.4g}, {lam[1]:.4g}] and mu in [{mu[0]:.4g}, {mu[1]:.4g}] Pa"
+        if f.key == "own" and lam[0] == lam[1] and mu[0] == mu[1]:
+            inside = f"lambda = {lam[0]:.4g}, mu = {mu[0]:.4g} Pa only"
+        lines.append(
+            f"Models {f.title} ({f.runs} full run{'s' if f.runs > 1 else ''}) answer for {inside} and "
+            f"accelerations of the hand up to {', '.join(f'{x:.3g}' for x in load)} by degree of freedom; they refuse "
+            "what lies outside."
+        )
+        errors = {N: [e for t in f.tests if (e := t.errors.get(N)) is not None] for N in f.models}
+        best = min(((statistics.median(e), N) for N, e in errors.items() if e), default=None)
+        if best is not None:
+            lines.append(f"Median error over {len(f.tests)} held-out runs: least at N = {best[1]}, {best[0]:.1e}.")
+        pairs = [(t.estimates[N], error) for t in f.tests for N, error in t.errors.items()]
+        ratios = [estimate / error for estimate, error in pairs if estimate is not None and error]
+        if ratios:
+            shares = [p.time_estimate / p.time_online for p in f.points]
+            lines.append(
+                f"The models estimate their own errors, an estimate and no bound: {min(ratios):.2g} to "
+                f"{max(ratios):.2g} times the true ones of {len(ratios)} held-out runs, in {min(shares):.2g} to "
+                f"{max(shares):.2g} times the time of a run."
+            )
+        lines += [f"N = {N} refused: {reason}." for N, reason in f.refused.items()]
+    if {p.engine for f in study.families for p in f.points} == {"NumPy"}:
+        lines.append("No C compiler was found, so the reduced runs stepped in NumPy, about thirty times slower.")
+    if study.none:
+        lines.append(f"No runs at other materials: {study.none}.")
+    return lines
+
+
+def summary(study: StrainStudy) -> list[str]:
+    """What came out, in three sentences."""
+    p, f = min(((p, f) for f in study.families for p in f.points), key=lambda pair: pair[0].error_own)
+    speed = study.times.against(p)
+    return [
+        f"Linear elasticity misses the deformation of this scene by {study.linear:.2%}.",
+        f"The most accurate reduced model, {f.title}, is {p.error_own:.2%} off with N = {p.N} columns and "
+        f"{p.cells} sampled cells.",
+        f"It runs {speed.again:.3g} times as fast as the full model, and {speed.new:.3g} times at a new parameter.",
+    ]

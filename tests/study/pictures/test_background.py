@@ -1,0 +1,49 @@
+"""Pictures are drawn beside the computation; files and errors come back as if they were drawn in place."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.errors import SceneError
+from softgrasp.study.pictures.background import draw_in_background
+
+HERE = os.getpid()
+COMM = MPI.COMM_WORLD
+
+
+def draw(out: Path) -> list[Path]:
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "drawn.png").write_text(str(os.getpid()))
+    return [out / "drawn.png"]
+
+
+@pytest.mark.ranks(2)
+def test_files_come_back(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    waits = draw_in_background(COMM, out, draw)
+    assert not out.exists()  # a command that fails before it asks leaves nothing
+    assert waits() == ([] if COMM.rank else [out / "drawn.png"])
+    forked = COMM.size == 1 and len(os.sched_getaffinity(0)) > 1
+    assert COMM.rank or ((out / "drawn.png").read_text() != str(HERE)) == forked
+
+
+@pytest.mark.serial
+def test_errors_come_back_and_a_lost_process_is_replaced(tmp_path: Path) -> None:
+    def refuse(out: Path) -> list[Path]:
+        raise SceneError("no such picture")
+
+    with pytest.raises(SceneError, match="no such picture"):
+        draw_in_background(COMM, tmp_path, refuse)()
+
+    def killed(out: Path) -> list[Path]:
+        if os.getpid() != HERE:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return draw(out)
+
+    assert draw_in_background(COMM, tmp_path, killed)() == [tmp_path / "drawn.png"]
+    assert (tmp_path / "drawn.png").read_text() == str(HERE)
