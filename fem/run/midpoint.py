@@ -26,7 +26,14 @@ import numpy as np
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, combine, total
 from softgrasp.fem.solve.held import held_operators
-from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
+from softgrasp.fem.solve.solvers import (
+    ITERATIVE,
+    Reproducible,
+    SolverName,
+    TissueSolver,
+    factor_on_every_rank,
+    make_solver,
+)
 from softgrasp.fem.system import BlockSystem, dynamic_stiffness
 
 if TYPE_CHECKING:
@@ -37,6 +44,10 @@ def make_midpoint(
     system: BlockSystem, dt: float, solver: SolverName, rtol: float = 1e-10, reproducible: Reproducible = "auto"
 ) -> TissueMidpoint:
     """The step of a system, linear or of finite strain; arguments as for `TissueMidpoint`. Collective."""
+    if system.points is None and solver in ITERATIVE:
+        from softgrasp.fem.run.inexact import InexactMidpoint
+
+        return InexactMidpoint(system, dt, solver, rtol, reproducible)
     if system.points is None:
         return TissueMidpoint(system, dt, solver, rtol, reproducible)
     from softgrasp.fem.run.finite_strain import FiniteStrainMidpoint  # only scenes with finite strain pay for it
