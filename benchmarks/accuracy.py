@@ -16,7 +16,7 @@ from benchmarks import driver
 from benchmarks.driver import Goal, cpu_seconds
 from softgrasp import package_version
 from softgrasp.fem import _stack as _stack  # threads and MPI before anything numerical
-from softgrasp.fem.accuracy.adapt import build_to_tolerance
+from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.model.build import Model, Stopwatch, build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import simulate
@@ -156,7 +156,7 @@ def reach(goal: float, exact: Array) -> TolerancePoint:
     comm, first, scene = MPI.COMM_WORLD, paper(graded(2, goal)), paper(graded(2, goal, ""))
 
     def whole() -> Model:
-        return build_to_tolerance(scene, comm, steps=False)
+        return adapt.build(scene, comm=comm, steps=False)
 
     model = whole()
     run, estimate = simulate(model), model.accuracy

@@ -22,9 +22,8 @@ from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.solvers import make_solver
-from softgrasp.study.effects.measure import RepeatableRun
 from softgrasp.study.report.origin import peak_memory_mb
-from softgrasp.study.shell.timing import interleave, medians, timed, warm
+from softgrasp.study.shell.timing import RepeatableRun, interleave, medians, timed, warm
 
 DT = 0.005  # [s], that of the paper: 600 steps in 3 s
 PAPER_STEPS = 600
@@ -190,7 +189,7 @@ def _loops(run: Run, factor: dict[str, float]) -> tuple[dict[str, Any], list[Any
         factor["petsc"] = time.perf_counter() - begin
         S.destroy()
         loops, solve, solvers = {"solve": petsc, "own": bare}, petsc.solve, [petsc.ksp]
-    if midpoint.held.whole and system.layout.comm.size > 1:
+    if midpoint.operators.whole and system.layout.comm.size > 1:
         solvers.append(make_solver(midpoint_matrix(system, DT), name, system.layout, "textbook_"))
         solve = solvers[-1].solve
     loops["loop"] = TextbookLoop(system, DT, solve, _loads(run.model))

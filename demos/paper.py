@@ -17,10 +17,10 @@ from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.reduction.bases.registry import PAPER_PLAIN
 from softgrasp.study.control.result import TITLES
 from softgrasp.study.control.run import run_control
-from softgrasp.study.forward.accuracy import percent
 from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.reduce.run import run_reduce
 from softgrasp.study.report.page import Section, write_report
+from softgrasp.study.report.tables import percent
 
 Row = tuple[str, str, str, str, str]
 HEADER = ("quantity", "paper", "here", "verdict", "why different")

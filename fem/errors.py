@@ -60,6 +60,10 @@ class Interrupted(SoftgraspError):
     """The user stopped the run; the message names the restart file."""
 
 
+class Paused(Interrupted):
+    """A run has come to the step up to which it was asked for."""
+
+
 @contextmanager
 def agree(comm: MPI.Intracomm) -> Iterator[None]:
     """Run a block that may fail on some ranks only; then raise on all of them.

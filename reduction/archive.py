@@ -18,8 +18,9 @@ from scipy.spatial import cKDTree
 
 from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.material import LayerMaterial
+from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.model import ModelError, Outputs, ReducedModel
 from softgrasp.reduction.operators import Reconstruction
 
@@ -27,14 +28,16 @@ if TYPE_CHECKING:
     from softgrasp.reduction.strain.model import StrainModel
 
 LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 2"
-SEALS = ("sha256", "sha256_lift")  # attributes: of everything but the reconstruction, and of the reconstruction
+CHECKSUMS = ("sha256", "sha256_lift")  # attributes: of everything but the reconstruction, and of the reconstruction
 ROWS = 1 << 16  # rows of the reconstruction read at a time: 30 MB for 60 columns
 # what a file says of a model in JSON, beside its materials and the names of its outputs
 LINEAR_KEYS = (
     "name", "N", "coordinates", "frame", "structure", "fixed_solid", "split", "alpha", "in_space", "damped",
-    "hand_weight", "two_way", "scene_hash", "seconds",
+    "hand_weight", "two_way", "scene_hash", "origin", "seconds",
 )  # fmt: skip
-STRAIN_KEYS = ("cells_full", "alpha", "in_space", "tau", "residual", "error_galerkin", "scene_hash", "seconds")
+STRAIN_KEYS = (
+    "cells_full", "alpha", "in_space", "tau", "residual", "error_galerkin", "scene_hash", "origin", "seconds",
+)  # fmt: skip
 STRAIN_ARRAYS = {
     "cells": ("B", "weight", "xi", "layer", "cell", "centre"),
     "box": ("lam", "mu", "load", "reach"),
@@ -163,6 +166,7 @@ def write_model(
         with agree(comm):
             if comm.rank == 0:
                 path.parent.mkdir(parents=True, exist_ok=True)
+                note(unfinished, path)
                 with h5py.File(unfinished, "w") as file:
                     file.attrs["format"], file.attrs["model"] = kind, json.dumps(about)
                     small(file)
@@ -174,7 +178,7 @@ def write_model(
         with agree(comm):
             if comm.rank == 0:
                 with h5py.File(unfinished, "r+") as file:
-                    seal(file)
+                    write_checksums(file)
                 unfinished.replace(path)
     finally:  # of a file that was not written whole
         if comm.rank == 0:
@@ -196,8 +200,8 @@ def reading(
                 if file.attrs.get("format") not in (LINEAR, STRAIN):
                     raise ModelError(f"{path} is no reduced model of this version ({LINEAR!r}); reduce the scene again")
                 # one rank reads a reconstruction twice, not all of them
-                for name in SEALS if layout is not None and comm.rank == 0 else SEALS[:1]:
-                    if file.attrs[name] != _digest(file, name == SEALS[1]):
+                for name in CHECKSUMS if layout is not None and comm.rank == 0 else CHECKSUMS[:1]:
+                    if file.attrs[name] != _digest(file, name == CHECKSUMS[1]):
                         raise ModelError(f"{path} is damaged: it is not what was written; reduce the scene again")
                 about = json.loads(file.attrs["model"])
                 if scene_hash is not None and about["scene_hash"] != scene_hash:
@@ -209,10 +213,10 @@ def reading(
             raise ModelError(f"{path} cannot be read as a reduced model ({reason}); reduce the scene again") from error
 
 
-def seal(file: h5py.File) -> None:
+def write_checksums(file: h5py.File) -> None:
     """Write the hashes of all that a file holds."""
-    for name in SEALS:
-        file.attrs[name] = _digest(file, name == SEALS[1])
+    for name in CHECKSUMS:
+        file.attrs[name] = _digest(file, name == CHECKSUMS[1])
 
 
 def _digest(file: h5py.File, reconstruction: bool) -> str:
@@ -223,7 +227,7 @@ def _digest(file: h5py.File, reconstruction: bool) -> str:
     for name in ["/", *sorted(names)]:
         item = file[name]
         if name.startswith("lift") is reconstruction:
-            attributes = sorted((key, str(value)) for key, value in item.attrs.items() if key not in SEALS)
+            attributes = sorted((key, str(value)) for key, value in item.attrs.items() if key not in CHECKSUMS)
             digest.update(repr((name, attributes)).encode())
             if isinstance(item, h5py.Dataset):
                 digest.update(repr(item.shape).encode())

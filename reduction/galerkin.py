@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.system import BlockSystem, LayerMaterial, coupling
+from softgrasp.fem.system import BlockSystem, coupling
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.operators import (
     Operators,

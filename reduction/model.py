@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError, Structure
 from softgrasp.reduction.canonical import canonical_operators
 from softgrasp.reduction.galerkin import galerkin_operators
@@ -173,6 +174,7 @@ class ReducedModel:
     gravity: Array | None = None  # acceleration of free fall in the hand's degrees of freedom, (n_s,), or None
     reconstruction: Reconstruction | None = None  # how states return to the mesh, or None
     scene_hash: str = ""  # of the scene the model was made for
+    origin: dict[str, Any] = field(default_factory=dict)  # of `reduction.origin`, what that scene says of a run; or {}
     seconds: dict[str, float] = field(default_factory=dict)  # offline time by stage
 
     def at(self, materials: tuple[LayerMaterial, ...] | None = None, gravity: Array | None = None) -> SmallModel:

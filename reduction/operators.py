@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, times_columns, total
-from softgrasp.fem.system import BlockSystem, LayerMaterial
+from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Basis
 
 Parts = dict[str, Array]

@@ -8,10 +8,10 @@ from itertools import product
 
 import numpy as np
 
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.snapshots import Snapshots
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.replay import FullRun, full_run
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -21,7 +21,13 @@ if TYPE_CHECKING:
     from softgrasp.fem.model.outputs import Output
 
 
-def project(basis: Basis, system: BlockSystem, outputs: Sequence[Output] = (), scene_hash: str = "") -> ReducedModel:
+def project(
+    basis: Basis,
+    system: BlockSystem,
+    outputs: Sequence[Output] = (),
+    scene_hash: str = "",
+    origin: dict[str, Any] | None = None,
+) -> ReducedModel:
     """Reduced model E x' = A x + B u + F g, y = C_z x + C_s q_s of a basis V of shape (2n, N). Collective.
 
     A basis in (q, v) gives the paper's Galerkin model with W = V [SBRH21] (`reduction.galerkin`), one in (q, p) a
@@ -61,6 +67,7 @@ def project(basis: Basis, system: BlockSystem, outputs: Sequence[Output] = (), s
         gravity=system.gravity,
         reconstruction=reconstruction,
         scene_hash=scene_hash,
+        origin=origin or {},
         seconds={**basis.seconds, "projection": seconds},
     )
 

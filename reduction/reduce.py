@@ -15,11 +15,13 @@ from softgrasp.reduction.bases.truncation import Truncation
 from softgrasp.reduction.errors import ModelErrors
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory
+from softgrasp.reduction.origin import origin_of
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, as_full, errors_linear, replay_linear
 
 if TYPE_CHECKING:  # only scenes with finite strain pay for its models
     from softgrasp.fem.model.build import Model
+    from softgrasp.fem.model.outputs import Output
     from softgrasp.reduction.strain.model import StrainModel, StrainRun
     from softgrasp.reduction.strain.training import StrainErrors
 
@@ -108,7 +110,7 @@ def replay(
 
     Args:
         rom: reduced model.
-        model: gives the materials.
+        model: gives the materials; all else that is neither motion nor time must be as in the scene of ``rom``.
         run: the full run; a :class:`softgrasp.reduction.replay.FullRun` is at materials of its own, a trajectory at
             those of ``model`` or, without effects.reaction, at any.
         allow: run a linear model with growing modes, or one at finite strain outside its training, all the same.
@@ -116,15 +118,16 @@ def replay(
     Raises:
         SceneError: see :func:`softgrasp.reduction.replay.full_run`.
         UnstableModelError: the reduced model has growing modes there.
-        ModelError: the reduced model cannot represent the materials, it has no run or no equilibrium to start in, or
-            the run lies outside the training box.
+        ModelError: the scene of ``model``, or of a full run, differs from that of ``rom`` in more than materials,
+            motion and time; or the reduced model cannot represent the materials, it has no run or no equilibrium to
+            start in, or the run lies outside the training box.
         SolverError: a step at finite strain did not converge.
     """
     if isinstance(rom, ReducedModel):
         return replay_linear(rom, model, run, allow_unstable=allow)
     from softgrasp.reduction.strain.training import replay_strain
 
-    return replay_strain(rom, as_full(model, run), outside=allow)
+    return replay_strain(rom, as_full(model, run), model, outside=allow)
 
 
 @overload
@@ -177,15 +180,18 @@ def reduce_linear(
     return project_scene(make_basis(method, states, N, inner, engine), model)
 
 
-def project_scene(basis: Basis, model: Model) -> ReducedModel:
+def project_scene(basis: Basis, model: Model, outputs: Sequence[Output] | None = None) -> ReducedModel:
     """Projection of a scene with its outputs, see :func:`softgrasp.reduction.projection.project`. Collective.
+
+    ``outputs``: those of the scene where they are made already.
 
     Raises:
         SolverError: the mass matrix cannot be factored.
         ReductionError: the scene has finite strain.
     """
     _check_linear(model)
-    return project(basis, model.system, model.outputs, model.scene_hash)
+    outputs = model.outputs if outputs is None else outputs
+    return project(basis, model.system, outputs, model.scene_hash, origin_of(model.scene_keys))
 
 
 def _check_linear(model: Model) -> None:

@@ -18,6 +18,7 @@ from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.errors import ModelComparison, ModelErrors, full_energy, shown_rows, state_rows, with_hand
 from softgrasp.reduction.model import ReducedModel, SmallModel
 from softgrasp.reduction.online import ReducedTrajectory
+from softgrasp.reduction.origin import Origin, check_origin
 from softgrasp.reduction.propagator import Propagator, propagator
 
 if TYPE_CHECKING:
@@ -85,8 +86,19 @@ def replay_linear(
     rom: ReducedModel, model: Model, run: Trajectory | FullRun, *, allow_unstable: bool = False
 ) -> ReducedTrajectory:
     """A linear model under the hand of a full run, see :func:`softgrasp.reduction.reduce.replay`. Collective."""
-    step, drive = replay_inputs(rom, rom.at(model.system.materials), as_full(model, run))
+    full = as_full(model, run)
+    check_scenes(rom.origin, rom.name, model, full)
+    step, drive = replay_inputs(rom, rom.at(model.system.materials), full)
     return online.run(step, allow_unstable=allow_unstable, **drive)
+
+
+def check_scenes(origin: Origin, name: str, model: Model, full: FullRun) -> None:
+    """Refuse scenes that differ in more than materials, motion and time, see :mod:`softgrasp.reduction.origin`.
+
+    Raises ModelError: with the first key that differs.
+    """
+    for each in (model,) if full.model.scene is model.scene else (model, full.model):
+        check_origin(origin, each.scene_keys, name)
 
 
 def errors_linear(rom: ReducedModel, reduced_run: ReducedTrajectory, full: FullRun) -> ModelErrors:

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from softgrasp.fem.accuracy.adapt import build as build
     from softgrasp.fem.model.build import Model as Model
-    from softgrasp.fem.model.build import build as build
     from softgrasp.fem.run.simulate import simulate as simulate
     from softgrasp.fem.scene.file import load_scene as load_scene
     from softgrasp.fem.scene.scene import Scene as Scene
@@ -47,7 +47,7 @@ _FACE = {
     "Scene": "fem.scene.scene",
     "load_scene": "fem.scene.file",
     "Model": "fem.model.build",
-    "build": "fem.model.build",
+    "build": "fem.accuracy.adapt",
     "simulate": "fem.run.simulate",
     "reduce": "reduction.reduce",
     "replay": "reduction.reduce",

@@ -17,7 +17,7 @@ import typer
 from softgrasp.fem.errors import SceneError
 from softgrasp.study.shell.ending import console, rank, run_command
 from softgrasp.study.shell.folder import default_folder
-from softgrasp.study.shell.options import takes
+from softgrasp.study.shell.options import parse_tolerance, takes
 
 LIST_WIDTH = 200  # [letters]
 app = typer.Typer(
@@ -210,7 +210,6 @@ def reduce(
     **shared: Any,
 ) -> None:
     """Build the reduced models of a scene and compare error and time; also under `mpiexec -n N`."""
-    from softgrasp.study.precision.answer import parse_tolerance
     from softgrasp.study.reduce.run import run_reduce
 
     _run(run_reduce, tolerance=None if tolerance is None else parse_tolerance(tolerance), **shared)
@@ -298,13 +297,13 @@ def study(
     question: Annotated[
         list[str] | None,
         typer.Option(
-            help="only this question: forward, reduced, bases, riccati, reduced_riccati or loop; several with commas"
+            help="only this question: forward, reduced, bases, riccati or reduced_riccati; several with commas"
         ),
     ] = None,
     **shared: Any,
 ) -> None:
     """Show what accuracy costs in time; resumes what an earlier run of the same scene left in the output folder."""
-    from softgrasp.study.precision.answer import parse_budget, parse_tolerance
+    from softgrasp.study.precision.answer import parse_budget
     from softgrasp.study.precision.run import run_study
 
     limit = None if budget is None else parse_budget(budget)

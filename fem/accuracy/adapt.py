@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.accuracy.estimate import estimate, marked_cells, next_order
-from softgrasp.fem.accuracy.small import Small, reduced
+from softgrasp.fem.accuracy.krylov import KrylovModel, krylov_model
 from softgrasp.fem.errors import SceneError, agree
 from softgrasp.fem.mesh.grading import bisect, distribute
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
-from softgrasp.fem.model.build import MeshEstimate, Model, build
+from softgrasp.fem.model.build import MeshEstimate, Model
+from softgrasp.fem.model.build import build as build_on
 from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
 from softgrasp.fem.petsc import Array
 
@@ -30,25 +33,44 @@ GUESSED = 0.7  # what a pass aims at, at least: too many cells cost more than an
 LINE_TRIES, LINE_STEP = 12, 0.7  # the number of lines grows with a small power of the tolerance
 
 
-def build_to_tolerance(scene: Scene, comm: MPI.Intracomm, steps: bool = True) -> Model:
-    """Build a scene on a mesh of its tolerance, with the estimate of what it reached; others as they are. Collective.
+def build(
+    scene: Scene | str | Path,
+    overrides: Sequence[str] = (),
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    *,
+    mesh: TissueMesh | None = None,
+    steps: bool = True,
+) -> Model:
+    """M q'' + D q' + K q = f + B_u u for q = [q_s; q_e], as in [SBRH21]: mesh, assemble, couple. Collective.
 
-    With ``passes = 0`` the mesh is the a-priori one, which nothing estimates here.
+    Where the scene has ``tissue.refine.tolerance`` its mesh is refined until the outputs of its run reach it, and
+    ``accuracy`` says what is left; with ``passes = 0`` the mesh is the a-priori one, which nothing estimates here.
 
-    ``steps``: whether the time steps have to carry the tolerance too: those of the scene's own run.
+    Args:
+        scene: a scene, the path of its file, or the name of one that ships.
+        overrides: "section.key=value" each, as after ``--set``; for a file or a name.
+        mesh: on which, as it is; None makes that of the scene.
+        steps: whether the time steps have to carry the tolerance too: those of the scene's own run.
 
     Raises:
-        SceneError: the time step leaves more than the tolerance, or the scene cannot be built.
-        MeshError, SolverError: see :func:`softgrasp.fem.model.build.build`.
+        SceneError, MeshError: with one sentence that names the key or the file; the time step leaves more than the
+            tolerance.
+        SolverError: a static solve of the estimate fails.
+        ResourceError: see :func:`softgrasp.fem.model.build.build`.
+
+    >>> import softgrasp as sg
+    >>> sg.build("paper_forward").states
+    1916
     """
     begin = time.perf_counter()
-    model, refine = build(scene, comm=comm), scene.tissue.refine
-    if refine is None or refine.tolerance is None or refine.passes == 0:
+    model = build_on(scene, overrides, comm, mesh=mesh)
+    scene, refine = model.scene, model.scene.tissue.refine
+    if refine is None or refine.tolerance is None or refine.passes == 0 or mesh is not None:
         return model
     passes, aim, accepted = 0, refine.tolerance, ACCEPTED
     last: tuple[Array, Array] | None = None
     while True:
-        small, finer = reduced(model), reduced(next_order(model))
+        small, finer = krylov_model(model), krylov_model(next_order(model))
         result, outputs = estimate(model, small, finer), small.run.deformation
         if last is not None:
             accepted = _effectivity(last[1], outputs + result.delta - last[0], result.delta)
@@ -57,7 +79,6 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm, steps: bool = True) ->
             _check_steps(scene, refine.tolerance, result.time_error)
         reached = result.estimate <= accepted * refine.tolerance
         obstacle = "" if reached else f"tissue.refine.passes = {refine.passes} are used up"
-        mesh: TissueMesh | None = None
         if not reached and passes < refine.passes:
             factor = 0.9 * max(accepted, GUESSED) * refine.tolerance / result.estimate
             aim *= factor
@@ -70,7 +91,7 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm, steps: bool = True) ->
             return replace(
                 model, accuracy=replace(result, tolerance=refine.tolerance, passes=passes, obstacle=obstacle)
             )
-        model, passes = build(scene, comm=comm, mesh=mesh), passes + 1
+        model, passes, mesh = build_on(scene, comm=comm, mesh=mesh), passes + 1, None
 
 
 def _effectivity(old: Array, error: Array, new: Array) -> float:
@@ -93,8 +114,12 @@ def estimated(model: Model) -> MeshEstimate:
     result, refine = estimate(model), model.scene.tissue.refine
     if refine is None or refine.tolerance is None:
         return result
-    missed = result.estimate > MISSED * refine.tolerance
-    obstacle = "tissue.refine.passes = 0 allow no better mesh" if missed else ""
+    limit, cause = (
+        (MISSED, "tissue.refine.passes = 0 allow no better mesh")
+        if refine.passes == 0
+        else (ACCEPTED, "its mesh is not one that was refined for this model")
+    )
+    obstacle = cause if result.estimate > limit * refine.tolerance else ""
     return replace(result, tolerance=refine.tolerance, obstacle=obstacle)
 
 
@@ -107,7 +132,7 @@ def _check_steps(scene: Scene, tolerance: float, error: float) -> None:
         )
 
 
-def _finer(small: Small, finer: Small, refine: Refine, aim: float, factor: float) -> TissueMesh | None:
+def _finer(small: KrylovModel, finer: KrylovModel, refine: Refine, aim: float, factor: float) -> TissueMesh | None:
     """The next mesh, or None if it has too many unknowns. Collective."""
     model = small.model
     comm, scene = model.system.layout.comm, model.scene

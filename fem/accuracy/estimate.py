@@ -2,7 +2,7 @@
 
     delta y(t) = y'(t) - y_h(t)
 
-is the difference of two small models (:mod:`softgrasp.fem.accuracy.small`) under the scene's own motion, start,
+is the difference of two small models (:mod:`softgrasp.fem.accuracy.krylov`) under the scene's own motion, start,
 damping and coupling: one of the mesh itself, one of elements of the next order on the same cells, or of a graded mesh
 where the mesh has no grading of its own. Both share the time step, whose error cancels. The graded mesh of a mesh file
 has its cells, some bisected, and the next order, or it would be no finer away from the ends; that of a box has cells of
@@ -30,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from softgrasp.fem.accuracy.small import Small, reduced, run_small, static_solves
+from softgrasp.fem.accuracy.krylov import KrylovModel, krylov_model, run_krylov, static_solves
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
@@ -53,7 +53,7 @@ COMPARED = {2: (1e-2, 1e-3), 3: (3e-2,)}  # tolerances of graded meshes to compa
 MOST_COMPARED = 60_000  # unknowns of such a mesh
 
 
-def estimate(model: Model, coarse: Small | None = None, finer: Small | None = None) -> MeshEstimate:
+def estimate(model: Model, coarse: KrylovModel | None = None, finer: KrylovModel | None = None) -> MeshEstimate:
     """Estimate the error that the mesh leaves in the outputs of the scene's run. Collective.
 
     Args:
@@ -65,16 +65,16 @@ def estimate(model: Model, coarse: Small | None = None, finer: Small | None = No
         SceneError, MeshError: the graded mesh to compare with cannot be made, or is too large.
     """
     begin = time.perf_counter()
-    small = coarse or reduced(model)
+    small = coarse or krylov_model(model)
     run = small.run
     if model.scene.tissue.refine is not None:
-        other = finer or reduced(next_order(model))
+        other = finer or krylov_model(next_order(model))
         by, bound, offer = "order", BOUNDS[min(model.scene.tissue.order, 3)], None
         relative, delta = difference(small, other)
         bound *= relative
     else:
         other, relative, delta, bound, by, offer = _compared(model, small)
-    halved = run_small(small, 2 * model.scene.time.steps).deformation[::2]
+    halved = run_krylov(small, 2 * model.scene.time.steps).deformation[::2]
     late, _ = difference(small, small, halved)
     delta = delta + other.run.rigid - run.rigid
     seen = min(2, len(small.M), len(other.M))  # a mesh of one free node has one mode that the run can see
@@ -94,7 +94,9 @@ def estimate(model: Model, coarse: Small | None = None, finer: Small | None = No
     )
 
 
-def _compared(model: Model, small: Small) -> tuple[Small, float, Array, float, str, tuple[float, int] | None]:
+def _compared(
+    model: Model, small: KrylovModel
+) -> tuple[KrylovModel, float, Array, float, str, tuple[float, int] | None]:
     """Finer model, estimate, delta y, bound, by and offer of :class:`MeshEstimate` for an ungraded mesh. Collective."""
     by, offer, box, order = "graded", None, model.scene.tissue.size is not None, model.scene.tissue.order
     count = next_unknowns(model)
@@ -104,7 +106,7 @@ def _compared(model: Model, small: Small) -> tuple[Small, float, Array, float, s
             f"{MOST_COMPARED} of an estimate; run the scene with another tissue.order and compare the outputs."
         )
     for goal in COMPARED[model.system.layout.dimension]:
-        other = reduced(like(model, comparison(model.scene, goal)))
+        other = krylov_model(like(model, comparison(model.scene, goal)))
         relative, delta = difference(small, other)
         if other.model.scene.tissue.order == 2:
             offer = (goal, other.model.system.layout.n_e)
@@ -112,14 +114,14 @@ def _compared(model: Model, small: Small) -> tuple[Small, float, Array, float, s
             return other, relative, delta, GRADED_BOUND * relative, by, offer
     bound = GRADED_BOUND * relative + goal
     if box and count <= MOST_COMPARED:
-        up = reduced(next_order(model))
+        up = krylov_model(next_order(model))
         more, change = difference(small, up)
         if more > relative:
             return up, more, change, max(bound, BOUNDS[min(order, 3)] * more), "order", offer
     return other, relative, delta, bound, by, offer
 
 
-def difference(small: Small, other: Small, finer: Array | None = None) -> tuple[float, Array]:
+def difference(small: KrylovModel, other: KrylovModel, finer: Array | None = None) -> tuple[float, Array]:
     """Largest difference of two runs over the largest deformation [1], and the difference (steps + 1, p).
 
     Outputs that are the hand's count only where there are no others.
@@ -210,7 +212,7 @@ GAIN = 1.2  # eta_T of the marked cells over what bisection takes away: it split
 LEAST, LARGEST = 0.15, 0.8  # share of the sum of eta_T that the marked cells hold [D96]
 
 
-def marked_cells(small: Small, finer: Small, factor: float) -> npt.NDArray[np.int32] | None:
+def marked_cells(small: KrylovModel, finer: KrylovModel, factor: float) -> npt.NDArray[np.int32] | None:
     """Cells to split, in the order of the mesh on rank 0; None on other ranks. Collective.
 
     Args:
@@ -231,7 +233,7 @@ def marked_cells(small: Small, finer: Small, factor: float) -> npt.NDArray[np.in
     return np.asarray(np.sort(cells[values >= least]), dtype=np.int32)
 
 
-def indicators(small: Small, finer: Small) -> Array:
+def indicators(small: KrylovModel, finer: KrylovModel) -> Array:
     """eta_T of the owned cells. Collective."""
     model, n_s, p, run = small.model, small.model.system.layout.n_s, len(small.C), small.run
     omega, Q = small.modes

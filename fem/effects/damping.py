@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from softgrasp.fem.effects.gate import Effect, Gate, Problem
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.system import Damping, LayerBlocks, LayerMaterial, layered_viscosity
+from softgrasp.fem.system import Damping, LayerBlocks, layered_viscosity
 
 
 def operator(scene: Scene, layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...]) -> Damping:

@@ -6,8 +6,8 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.system import LayerMaterial
 
 SMALL_SHARE = 0.01  # of the volume: at the edge of the contact zone the strain of any fine mesh is large
 
@@ -60,7 +60,7 @@ class Gate:
 
 @dataclass(frozen=True)
 class Problem:
-    """Scales of one scene; `fem.fields.scales` computes them."""
+    """Scales of one scene; `fem.model.scales` computes them."""
 
     scene: Scene
     dimension: int  # 2 or 3

@@ -28,7 +28,7 @@ class GravityEffect(Effect):
     threshold = 0.01
 
     def gate(self, problem: Problem) -> Gate:
-        """Gradient of the static displacement under the weight, bending included; `fem.fields.scales` solves for it."""
+        """Gradient of the static displacement under the weight, bending included; `fem.model.scales` solves for it."""
         off, sag, length = problem.scene.effects.gravity is None, problem.sag, problem.length
         number = sag.gradient.typical
         bends = f"sag by {sag.largest:.2g} m, {sag.largest / length:.2g} of its length {length:.3g} m"

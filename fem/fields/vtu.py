@@ -13,6 +13,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from softgrasp.fem.errors import agree
+from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array, on_root
 
 HEAD = '<?xml version="1.0"?>\n<VTKFile type="{}" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
@@ -96,7 +97,7 @@ def write_vtu(
     contents = [(begin + start, own)]
     if comm.rank == 0:
         contents += [(0, head + shared), (begin + length, b"\n</AppendedData>\n</VTKFile>\n")]
-    on_root(comm, lambda: path.unlink(missing_ok=True))
+    on_root(comm, lambda: _begin(path))
     try:
         file = MPI.File.Open(comm, str(path), MPI.MODE_CREATE | MPI.MODE_WRONLY)
         try:
@@ -107,6 +108,11 @@ def write_vtu(
             file.Close()
     except MPI.Exception as error:
         raise OSError(f"{path}: {error}") from error
+
+
+def _begin(path: Path) -> None:
+    note(path)
+    path.unlink(missing_ok=True)
 
 
 def _xml(parts: dict[str, list[Field]], start: int) -> str:
@@ -124,14 +130,15 @@ def _xml(parts: dict[str, list[Field]], start: int) -> str:
 class Collection:
     """The files of a series against time, a whole ``.pvd`` file after each `add`; rank 0 only.
 
-    ``note``: a remark kept in it; no "--".
+    ``remark``: kept in it; no "--".
     """
 
     END = b"</Collection>\n</VTKFile>\n"
 
-    def __init__(self, path: Path, note: str) -> None:
+    def __init__(self, path: Path, remark: str) -> None:
         self.path = path
-        path.write_bytes(f"{HEAD.format('Collection')}<!--{note}-->\n<Collection>\n".encode() + self.END)
+        note(path)
+        path.write_bytes(f"{HEAD.format('Collection')}<!--{remark}-->\n<Collection>\n".encode() + self.END)
 
     def add(self, t: float, file: Path) -> None:
         """Append the file of an instant t [s]."""

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from softgrasp.fem.checksums import digest
 from softgrasp.fem.errors import MeshError, agree
 from softgrasp.fem.mesh.cells import (
     DIMENSIONS,
@@ -36,7 +37,6 @@ from softgrasp.fem.mesh.check import (
 )
 from softgrasp.fem.mesh.foreign import read_foreign
 from softgrasp.fem.mesh.tissue_mesh import Marks, MeshArrays, Sets, TissueMesh, spread
-from softgrasp.fem.sealed import digest
 
 
 def _text(sets: Sets) -> str:

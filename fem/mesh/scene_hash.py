@@ -1,10 +1,11 @@
-"""The hash of a scene: of its keys, of the mesh that was read and of its csv file."""
+"""A scene by its keys, the mesh that was read and its csv file: one hash of all of it, or key by key."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Iterable
+from typing import Any
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
@@ -17,13 +18,33 @@ def scene_hash(scene: Scene, without: Iterable[str] = ("name", "description")) -
     model of this scene was built with; without a model it is read. Raises SceneError, MeshError: a file that the scene
     names cannot be read.
     """
+    return hashlib.sha256(json.dumps(_resolved(scene, without), sort_keys=True).encode()).hexdigest()
+
+
+def scene_keys(scene: Scene) -> dict[str, Any]:
+    """Value of every key of the resolved scene by its whole name, a file by the hash of what it holds; None left out.
+
+    Raises SceneError, MeshError: as :func:`scene_hash`.
+    """
+    flat: dict[str, Any] = {}
+    todo = list(reversed(_resolved(scene, ()).items()))
+    while todo:
+        key, value = todo.pop()
+        if isinstance(value, dict):
+            todo += [(f"{key}.{part}", each) for part, each in reversed(value.items())]
+        elif value is not None:
+            flat[key] = value
+    return flat
+
+
+def _resolved(scene: Scene, without: Iterable[str]) -> dict[str, Any]:
     data = scene.model_dump(mode="json", by_alias=True, exclude=set(without))
     tissue, motion = data.get("tissue", {}), data.get("motion", {})
     if tissue.get("mesh") is not None:
         tissue["mesh"] = scene._mesh_digest or _mesh_digest(scene)
     if motion.get("csv") is not None:
         motion["csv"] = hashlib.sha256(_bytes(scene, motion["csv"], "motion.csv")).hexdigest()
-    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+    return data
 
 
 def _mesh_digest(scene: Scene) -> str:

@@ -16,7 +16,6 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.check import Floats, Integers, Ints, Parts
-from softgrasp.fem.scene.scene import Scene
 
 Sets = dict[int | str, tuple[int, ...]]  # marks of each tag number and named set of a file
 Marks = dict[str, tuple[int, Integers, Ints | None]]  # dimension of entities, their nodes, one value each or None
@@ -137,26 +136,6 @@ def spread(comm: MPI.Intracomm, arrays: MeshArrays | None) -> TissueMesh:
         entities = adjacencylist(np.ascontiguousarray(local, dtype=np.int32))
         tags[name] = dolfinx.mesh.meshtags_from_entities(mesh, dimension, entities, here.astype(np.int32))
     return TissueMesh(mesh=mesh, dimension=d, **known, **tags)
-
-
-def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
-    """Build the mesh of a scene: structured if ``tissue.size`` is given, else from ``tissue.mesh``.
-
-    Collective.
-
-    Raises:
-        SceneError: the cells do not fit the size.
-        MeshError: the mesh file cannot be read or its mesh cannot carry the model.
-    """
-    tissue = scene.tissue
-    if tissue.size:
-        return structured_mesh(comm, tissue.size, tissue.cells or [], tissue.origin)
-    from softgrasp.fem.mesh.file import read_mesh  # meshio is needed for mesh files only
-
-    path = scene.directory / str(tissue.mesh)
-    result = read_mesh(comm, path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit)
-    scene._mesh_digest = result.digest  # the hash of the scene is of what was read, not of what the file says later
-    return result
 
 
 def structured_mesh(

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,10 @@ from softgrasp.fem.effects.damping import operator as damping_operator
 from softgrasp.fem.effects.gravity import acceleration
 from softgrasp.fem.effects.rotation import hand_mass
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh, make_mesh
+from softgrasp.fem.material import LayerMaterial
+from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.mesh.scene_hash import scene_hash, scene_keys
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise, make_points
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.memory import box_simplices, check_memory
@@ -25,7 +28,7 @@ from softgrasp.fem.model.outputs import Output, make_outputs, output_columns
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.scene import Scene, check_dimension
-from softgrasp.fem.system import BlockSystem, LayerBlocks, LayerMaterial, coupling, tissue_matrices
+from softgrasp.fem.system import BlockSystem, LayerBlocks, coupling, tissue_matrices
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,11 @@ class Model:
         """See :func:`softgrasp.fem.mesh.scene_hash.scene_hash`."""
         return scene_hash(self.scene)
 
+    @cached_property
+    def scene_keys(self) -> dict[str, Any]:
+        """See :func:`softgrasp.fem.mesh.scene_hash.scene_keys`."""
+        return scene_keys(self.scene)
+
     def displacement(self, z: Array, q_s: Array) -> Any:
         """Absolute displacement u = R q_s + (z + T q_s) as a function [m], ghosts updated. Collective.
 
@@ -167,7 +175,7 @@ def build(
     mesh: TissueMesh | None = None,
     run: bool = True,
 ) -> Model:
-    """M q'' + D q' + K q = f + B_u u for q = [q_s; q_e], as in [SBRH21]: mesh, assemble, couple. Collective.
+    """The model of a scene on its a-priori mesh or another; :mod:`softgrasp.fem.accuracy.adapt` refines. Collective.
 
     Args:
         scene: a scene, the path of its file, or the name of one that ships.
@@ -179,10 +187,6 @@ def build(
         SceneError, MeshError: with one sentence that names the key or the file.
         ResourceError: the memory of a node cannot hold it; estimated before anything is allocated, for a mesh file
             when its cells are known.
-
-    >>> import softgrasp as sg
-    >>> sg.build("paper_forward").states
-    1916
     """
     if isinstance(scene, str | Path):
         scene = load_scene_collective(comm, scene, overrides)

@@ -27,8 +27,9 @@ from softgrasp.fem.mesh.grading import (
     distribute,
     even_cells,
 )
+from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.mesh.singular import Ends, singular_ends
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole, make_mesh
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
 from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.contact import contact_facets
 from softgrasp.fem.petsc import on_root

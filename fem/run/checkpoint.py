@@ -8,13 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 
+from softgrasp.fem.checksums import (
+    AGAIN,
+    digest,
+    read_arrays,
+    read_manifest,
+    remove_others,
+    write_arrays,
+    write_manifest,
+)
 from softgrasp.fem.errors import CheckpointError, agree, shortened
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.sealed import AGAIN, digest, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
 
 FORMAT = 6
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # what a run shows and keeps, not what it computes
@@ -123,28 +133,45 @@ def read_checkpoint(scene: Scene, layout: BlockLayout, directory: Path) -> Resta
         return RestartState(entry["run"], entry["step"], entry["legs"], entry["beside"], **arrays)
 
 
+def check_ranks(comm: MPI.Intracomm, directory: Path) -> None:
+    """Refuse before anything is built what :func:`read_checkpoint` would refuse after it. Collective.
+
+    Raises CheckpointError: no restart file, a damaged one, or one of another rank count.
+    """
+    with agree(comm):
+        if comm.rank == 0:
+            manifest = directory / "checkpoint.json"
+            _same_ranks(manifest, read_manifest(manifest, FORMAT), comm.size)
+
+
+def _same_ranks(manifest: Path, entry: dict[str, Any], ranks: int) -> None:
+    if entry["ranks"] != ranks:
+        raise CheckpointError(
+            f"{manifest} was written on {counted(entry['ranks'], 'rank')}, this run has {ranks}; resume with "
+            f"mpiexec -n {entry['ranks']}, or run again without --resume"
+        )
+
+
 def _fitting(scene: Scene, ranks: int, manifest: Path, entry: dict[str, Any]) -> dict[str, Any]:
     """The manifest's entry if it is of this scene and rank count.
 
     Raises CheckpointError: it is not; the message names the key.
     """
-    before, now = {"ranks": entry["ranks"]}, {"ranks": ranks}
-    same = entry["scene_hash"] == _numbers_hash(scene)
-    if not same:
-        before, now = _flat(entry["scene"]), _flat(scene.model_dump(mode="json", by_alias=True))
+    _same_ranks(manifest, entry, ranks)
+    if entry["scene_hash"] == _numbers_hash(scene):
+        return entry
+    before, now = _flat(entry["scene"]), _flat(scene.model_dump(mode="json", by_alias=True))
     keys = [*now, *(key for key in before if key not in now)]
     for key in sorted(keys, key=lambda key: key in ("tissue.mesh", "motion.csv")):  # their contents count, not the name
         if before.get(key) != now.get(key) and not _free(key):
             raise CheckpointError(
                 f"{manifest} was written with {key} = {_short(before.get(key))}, this run has {_short(now.get(key))}; "
-                "resume with the same scene and rank count, or run again without --resume"
+                "resume with the same scene, or run again without --resume"
             )
-    if not same:
-        raise CheckpointError(
-            f"a file that the scene names is not what it was when {manifest} was written; put the old one back, or run "
-            "again without --resume"
-        )
-    return entry
+    raise CheckpointError(
+        f"a file that the scene names is not what it was when {manifest} was written; put the old one back, or run "
+        "again without --resume"
+    )
 
 
 def _numbering(layout: BlockLayout) -> Array:

@@ -30,14 +30,14 @@ from softgrasp.fem.strain.points import whole_points
 
 PARTS = 16  # most of a step
 KEPT = 2  # steps that the first guess is extrapolated from
-Begin = tuple[PETSc.Vec, Array, Array, float]  # z, s pi and v / s on the rows held, and what is dissipated
+Begin = tuple[PETSc.Vec, Array, Array, float]  # z, s pi and v / s on the rows here, and what is dissipated
 
 
 class FiniteStrainMidpoint(TissueMidpoint):
     """The step for a system with points; arguments and calls are those of the linear step.
 
     Attributes:
-        r: s pi_n on the rows held, in place of the linear step's right-hand side.
+        r: s pi_n on the rows here, in place of the linear step's right-hand side.
         counts: see there.
         price: about how many iterations cost as much as a tangent and its factor, from sizes: the same in every run.
     """
@@ -52,15 +52,15 @@ class FiniteStrainMidpoint(TissueMidpoint):
         assert points is not None
         self.comm: MPI.Intracomm = system.layout.comm
         self.dot: Callable[[Array, Array], float] = np.dot
-        if self.comm.size > 1 and not self.held.whole:
+        if self.comm.size > 1 and not self.operators.whole:
             self.dot = lambda a, b: self.over_ranks(float(np.dot(a, b)))
-        if self.held.whole:
-            points = whole_points(points, self.comm, self.held.enter(np.arange(system.layout.n_e)))
-        self.body, self.tol = Body(points, system.materials, None if self.held.whole else system.K_ee), points.tol
+        if self.operators.whole:
+            points = whole_points(points, self.comm, self.operators.enter(np.arange(system.layout.n_e)))
+        self.body, self.tol = Body(points, system.materials, None if self.operators.whole else system.K_ee), points.tol
         if not self.comm.allreduce(self.body.kernel is not None, MPI.LAND):
             self.body.kernel = None  # ranks that hold all rows compute the same bits
-        self.inertia, self.drag = (*self.held.parts, None)[:2]
-        for part in self.held.parts:
+        self.inertia, self.drag = (*self.operators.parts, None)[:2]
+        for part in self.operators.parts:
             part.convert("aij")
         self.trial, self.f, self.y, self.solved = (self.w.duplicate() for _ in range(4))
         vectors = (self.trial, self.f, self.y, self.solved)
@@ -77,7 +77,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     parts: int  # into which the step in work is divided
     jump: Array | None  # of the velocity over a divided step
-    rate: Array  # (v_0 + v_1) / 2s of a divided step, on the rows held
+    rate: Array  # (v_0 + v_1) / 2s of a divided step, on the rows here
     feedback: Feedback | None
     sensed: Array  # p of feedback
     now: TissueState  # where the step in work begins
@@ -90,10 +90,10 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     def _dots(self, A: Array, x: Array) -> Array:
         products = A @ x
-        return products if self.held.whole else total(self.comm, products)
+        return products if self.operators.whole else total(self.comm, products)
 
     def _all(self, fine: bool) -> bool:
-        return fine if self.held.whole else bool(self.comm.allreduce(fine, MPI.LAND))
+        return fine if self.operators.whole else bool(self.comm.allreduce(fine, MPI.LAND))
 
     # ---- the state
 
@@ -119,7 +119,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.at, self.begin = z, self.body.start(z)
         self.counts.min_det = min(self.counts.min_det, 1 + float(self.begin.j.min(initial=np.inf)))
         if check or not self.body.law.barrier:
-            self.body.refuse(self.begin, None if self.held.whole else self.comm)
+            self.body.refuse(self.begin, None if self.operators.whole else self.comm)
 
     def energy(self, state: TissueState) -> float:
         """Energy W(z) + v'pi/2 [J] of the state just reached. Collective."""
@@ -130,15 +130,15 @@ class FiniteStrainMidpoint(TissueMidpoint):
     def figures(self) -> NewtonFigures:
         """How the steps converged. Collective."""
         counts, least = self.counts, self.counts.min_det
-        least = least if self.held.whole else float(self.comm.allreduce(least, MPI.MIN))
+        least = least if self.operators.whole else float(self.comm.allreduce(least, MPI.MIN))
         mean = counts.iterations / max(counts.steps, 1)
         return NewtonFigures(mean, counts.most, counts.factors, least, counts.divided)
 
     def memory(self) -> dict[str, Array]:
-        """What a restart needs beside r and the state: tangent, pairs, last steps, counts; rows as they are held."""
+        """What a restart needs beside r and the state: tangent, pairs, last steps, counts; rows as they lie here."""
         pairs = self.newton.pairs
         tangent = [] if self.tangent_at is None else [self.tangent_at]
-        rows = [self.held.leave(x) for x in (*tangent, *self.past, *pairs.dx, *pairs.dr)]
+        rows = [self.operators.leave(x) for x in (*tangent, *self.past, *pairs.dx, *pairs.dr)]
         sizes = [len(tangent), len(self.past), len(pairs.order), pairs.order[-1] if pairs.order else 0]
         numbers = np.array([*sizes, *vars(self.counts).values()], dtype=float)
         return {"solver_rows": np.array(rows).reshape(len(rows), len(self.r_array)), "solver_numbers": numbers}
@@ -148,7 +148,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         if rows is None or numbers is None:
             return
         tangents, past, count, newest = (int(n) for n in numbers[:4])
-        kept = [self.held.enter(x) for x in rows]
+        kept = [self.operators.enter(x) for x in rows]
         if tangents:
             self._renew(kept[0])
         self.past = deque(kept[tangents : tangents + past], maxlen=KEPT)
@@ -164,8 +164,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
     # ---- a step
 
     def hold(self, N: Array) -> Array:
-        """Columns on the owned rows, (n_local, m), as they are held. Collective."""
-        return np.asfortranarray(self.held.gather(N))
+        """Columns on the owned rows, (n_local, m), as they lie here. Collective."""
+        return np.asfortranarray(self.operators.gather(N))
 
     def solve_midpoint(self, c: Array, feedback: Feedback | None = None) -> None:
         """Solve R(w) = 0 under the load G (c + C p); ``self.c`` is c + C p then, ``sensed`` is p. Collective.
@@ -284,7 +284,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         Raises SolverError: no number of parts converges.
         """
         feedback, self.feedback, at = self.feedback, None, self.at
-        begin = at, self.r_array.copy(), self.held.gather(self.now.v.array_r) / self.s, self.dissipated
+        begin = at, self.r_array.copy(), self.operators.gather(self.now.v.array_r) / self.s, self.dissipated
         while self.parts < PARTS:
             self.parts *= 2
             root = self._taken(c, begin) if feedback is None else self._balanced(c, feedback, begin)
@@ -295,7 +295,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
             self._renew_about(root.x)
             return root
         self.parts = 1
-        J, place = self.body.lowest(self.body.J, None if self.held.whole else self.comm)
+        J, place = self.body.lowest(self.body.J, None if self.operators.whole else self.comm)
         raise SolverError(
             f"finite strain ({self.body.law.name}): no convergence (16 parts of the step did not help); in the cell at "
             f"{place} the last trial has det F = {J:.3g}: take more time.steps, a finer mesh or a gentler motion"
@@ -356,7 +356,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
             new.v.array_w[:] = v
 
     def pull(self) -> Array:
-        """G'w with w = (z_1 - z_0) / 2, and with (v_0 + v_1) / 2s, over the rows held, (2 n_s,)."""
+        """G'w with w = (z_1 - z_0) / 2, and with (v_0 + v_1) / 2s, over the rows here, (2 n_s,)."""
         work = super().pull()
         return np.concatenate([work, work if self.jump is None else self.G.T @ self.rate])
 
@@ -381,8 +381,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
         self.body.destroy()
-        for item in (*self.held.parts, self.trial, self.f, self.y, self.solved):
+        for item in (*self.operators.parts, self.trial, self.f, self.y, self.solved):
             item.destroy()
-        if self.held.whole:  # else the points are the system's
+        if self.operators.whole:  # else the points are the system's
             self.body.points.B.destroy()
         super().destroy()

@@ -107,7 +107,7 @@ class InexactMidpoint(TissueMidpoint):
     def advance(self, old: TissueState, new: TissueState) -> None:
         """Write the new state and carry k and r on, with S w in place of r. Collective."""
         super().advance(old, new)
-        if self.held.D is None:  # else the momentum is M v and asks for no S w
+        if self.operators.D is None:  # else the momentum is M v and asks for no S w
             self.r.axpy(self.a, self.defect)
 
     def memory(self) -> dict[str, Array]:

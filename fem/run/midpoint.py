@@ -25,34 +25,12 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, combine, total
-from softgrasp.fem.solve.held import held_operators
-from softgrasp.fem.solve.solvers import (
-    ITERATIVE,
-    Reproducible,
-    SolverName,
-    TissueSolver,
-    factor_on_every_rank,
-    make_solver,
-)
+from softgrasp.fem.solve.replicated import replicated_operators
+from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
 from softgrasp.fem.system import BlockSystem, dynamic_stiffness
 
 if TYPE_CHECKING:
     from softgrasp.fem.strain.newton import NewtonFigures
-
-
-def make_midpoint(
-    system: BlockSystem, dt: float, solver: SolverName, rtol: float = 1e-10, reproducible: Reproducible = "auto"
-) -> TissueMidpoint:
-    """The step of a system, linear or of finite strain; arguments as for `TissueMidpoint`. Collective."""
-    if system.points is None and solver in ITERATIVE:
-        from softgrasp.fem.run.inexact import InexactMidpoint
-
-        return InexactMidpoint(system, dt, solver, rtol, reproducible)
-    if system.points is None:
-        return TissueMidpoint(system, dt, solver, rtol, reproducible)
-    from softgrasp.fem.run.finite_strain import FiniteStrainMidpoint  # only scenes with finite strain pay for it
-
-    return FiniteStrainMidpoint(system, dt, solver, rtol, reproducible)
 
 
 def midpoint_matrix(system: BlockSystem, dt: float) -> PETSc.Mat:
@@ -94,7 +72,7 @@ class Feedback(NamedTuple):
     """
 
     C: Array  # (n_s, m)
-    N: Array  # on the rows held, (rows, m)
+    N: Array  # on the rows here, (rows, m)
     speed: Array  # (m,)
 
 
@@ -111,13 +89,13 @@ class TissueMidpoint:
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 
     Attributes:
-        held: operators on the rows held.
-        r, w, k: vectors on the rows held; ``r_array``, ``w_array``, ``k_array`` their arrays.
+        operators: on the rows here.
+        r, w, k: vectors on the rows here; ``r_array``, ``w_array``, ``k_array`` their arrays.
         c: coefficients of the load of the step in work, (n_s,).
         pending: coefficients p of the load that r still lacks between steps, h = r + G p, (n_s,).
         K2: -2 K, whose product one call adds to r.
         k: K2 z; a step carries it where damping needs the old one.
-        x: the rows of w that this rank owns, in the order of the state; w itself unless the vectors are held whole.
+        x: the rows of w that this rank owns, in the order of the state; w itself unless the vectors are whole here.
     """
 
     def __init__(
@@ -130,13 +108,13 @@ class TissueMidpoint:
     ) -> None:
         self.system, self.dt, self.s = system, dt, 2 / dt
         whole, ordered = factor_on_every_rank(system.layout, solver, reproducible), solver == "cholesky"
-        self.held = held_operators(system, midpoint_matrix(system, dt), whole, ordered, self._parts())
-        self.G, self.rows = self.held.G, self.held.rows
-        self.K2 = self.held.K
+        self.operators = replicated_operators(system, midpoint_matrix(system, dt), whole, ordered, self._parts())
+        self.G, self.rows = self.operators.G, self.operators.rows
+        self.K2 = self.operators.K
         self.K2.scale(-2.0)
-        with self.held.agree():
+        with self.operators.agree():
             self.solver: TissueSolver = make_solver(
-                self.held.S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible, ordered
+                self.operators.S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible, ordered
             )
         self._solve = self.solver.solve if self.solver.factor is None else self.solver.factor.solve
         self.r, self.k, self.w = (self.K2.createVecLeft() for _ in range(3))
@@ -144,7 +122,7 @@ class TissueMidpoint:
         self.w_array, self.r_array, self.k_array = self.w.array_w, self.r.array_r, self.k.array_r
         self._couple()
         self.x, self._move = self.w, self._held_z
-        if self.held.whole:
+        if self.operators.whole:
             self.x, self.z = system.K_ee.createVecRight(), self.w.duplicate()
             self._move = self._move_whole
         self.x_array: Array = self.x.array_w
@@ -172,12 +150,12 @@ class TissueMidpoint:
 
     def _picker(self) -> Callable[[], object]:
         """What copies the owned rows of w to x."""
-        layout, order = self.system.layout, self.held.order
+        layout, order = self.system.layout, self.operators.order
         if order is not None:
             w, x = (array.reshape(-1, order.d) for array in (self.w_array, self.x_array))
             places = order.places_of(layout.start, layout.start + layout.n_local)
             return partial(w.take, places, 0, x, "clip")  # "raise" would copy x
-        if self.held.whole:
+        if self.operators.whole:
             return partial(np.copyto, self.x_array, self.w_array[self.rows])
         return lambda: None  # x is w
 
@@ -201,9 +179,9 @@ class TissueMidpoint:
         """The damping matrix with its mass-proportional part, so that a step needs one product with it. Collective."""
         self.y = self.k.duplicate()
         self.y_array = self.y.array_r
-        if self.held.D is None or self.held.M is None:
+        if self.operators.D is None or self.operators.M is None:
             raise SolverError("a damping matrix is missing")
-        self.M, self.D = self.held.M, self.held.D.copy()
+        self.M, self.D = self.operators.M, self.operators.D.copy()
         self.D.axpy(self.alpha, self.M, SAME)
         self._propagate = self._general
 
@@ -217,7 +195,7 @@ class TissueMidpoint:
         self.join(state)
         y = state.z.duplicate()
         self.system.M_ee.mult(state.v, y)
-        self.r.array_w[:] = self.s * self.held.gather(y.array_r)
+        self.r.array_w[:] = self.s * self.operators.gather(y.array_r)
         y.destroy()
         self.c = self.pending = np.zeros_like(self.c)
 
@@ -226,13 +204,13 @@ class TissueMidpoint:
         self.K2.mult(self._gathered_z(state), self.k)
 
     def _gathered_z(self, state: TissueState) -> PETSc.Vec:
-        """The rows held of a new state. Collective."""
-        if self.held.whole:
-            self.z.array_w[:] = self.held.gather(state.z.array_r)
+        """The rows here of a new state. Collective."""
+        if self.operators.whole:
+            self.z.array_w[:] = self.operators.gather(state.z.array_r)
         return self._held_z(state)
 
     def _held_z(self, state: TissueState) -> PETSc.Vec:
-        return self.z if self.held.whole else state.z
+        return self.z if self.operators.whole else state.z
 
     def solve_midpoint(self, c: Array, feedback: Feedback | None = None) -> None:
         """Solve S w = h + G c, once a step. Collective.
@@ -260,7 +238,7 @@ class TissueMidpoint:
         solve missed its tolerance.
         """
         self.Y = np.empty(self.G.shape, order="F")
-        with self.held.agree():
+        with self.operators.agree():
             for j in range(self.Y.shape[1]):
                 self.r.array_w[:] = self.G[:, j]
                 self.solver.solve(self.r, self.w)
@@ -289,12 +267,12 @@ class TissueMidpoint:
         self.pending = self.c
 
     def pull(self) -> Array:
-        """G'w over the rows held, (n_s,), until the next call: the load l = G c of the step did the work 2 c'G'w."""
+        """G'w over the rows here, (n_s,), until the next call: the load l = G c of the step did the work 2 c'G'w."""
         self.coupling.multTranspose(self.w_here, self.moved)
         return self.moved_array
 
     def _move_whole(self, state: TissueState) -> PETSc.Vec:
-        """The rows held of a new z, by the operations that gave the state its rows: the same bits."""
+        """The rows here of a new z, by the operations that gave the state its rows: the same bits."""
         self.z.axpy(2.0, self.w)
         return self.z
 
@@ -333,7 +311,7 @@ class TissueMidpoint:
 
     def over_ranks(self, share: float) -> float:
         """Sum over the ranks of what each computed on the rows it holds, which may be all of them. Collective."""
-        return share if self.held.whole else float(total(self.system.layout.comm, np.array([share]))[0])
+        return share if self.operators.whole else float(total(self.system.layout.comm, np.array([share]))[0])
 
     def residual(self) -> float:
         """Check a solve, before :meth:`advance` takes r further; raises SolverError. Collective.
@@ -343,7 +321,7 @@ class TissueMidpoint:
         """
         load = self.G[self.rows] @ self.c
         square = total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]
-        with self.held.agree():
+        with self.operators.agree():
             return self.solver.check(self.r, self.w, "the midpoint", float(np.sqrt(square)))
 
     def figures(self) -> NewtonFigures | None:
@@ -360,7 +338,7 @@ class TissueMidpoint:
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
         self.solver.destroy()
-        self.held.destroy()
+        self.operators.destroy()
         for name in ("r", "k", "x", "w", "r_here", "w_here", "added", "moved", "coupling", "k_old", "y", "z", "D"):
             if hasattr(self, name):
                 getattr(self, name).destroy()

@@ -12,19 +12,20 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError, SceneError, SolverError, agree
+from softgrasp.fem.checksums import AGAIN
+from softgrasp.fem.errors import CheckpointError, Interrupted, Paused, ResourceError, SceneError, SolverError, agree
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import Output, make_outputs
+from softgrasp.fem.owned import locked
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
 from softgrasp.fem.run.interrupt import interruptible
-from softgrasp.fem.run.midpoint import make_midpoint
+from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.motion import Force, ForceDrive, TableDrive, force_taken, force_values, free_table
 from softgrasp.fem.run.snapshots import make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.sealed import AGAIN
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
 
@@ -150,7 +151,7 @@ class Run(Stepped):
         """Force on the hand in each step, see :class:`Trajectory`. Collective."""
         if self.drive.u is not None:
             return self.drive.u
-        pulls = self.pulls[1:] if self.midpoint.held.whole else total(self.layout.comm, self.pulls[1:])
+        pulls = self.pulls[1:] if self.midpoint.operators.whole else total(self.layout.comm, self.pulls[1:])
         return force_taken(self.model.system, pulls, self.drive.v, self.drive.c, self.dt)
 
     def watch_energy(self) -> None:
@@ -184,7 +185,7 @@ class Run(Stepped):
             legs=self.legs,
             beside=self.beside,
             state=self.state.array,
-            r=midpoint.held.leave(midpoint.r.array_r),
+            r=midpoint.operators.leave(midpoint.r.array_r),
             pending=midpoint.pending,
             hand_q=self.drive.q[: n + 1],
             hand_v=self.drive.v[: n + 1],
@@ -214,7 +215,7 @@ class Run(Stepped):
         self.name, self.beside = saved.run, saved.beside
         self.state = self.store.target(n)
         self.state.array[:] = saved.state
-        midpoint.r.array_w[:] = midpoint.held.enter(saved.r)
+        midpoint.r.array_w[:] = midpoint.operators.enter(saved.r)
         midpoint.pending = saved.pending
         self.drive.q[: n + 1], self.drive.v[: n + 1] = saved.hand_q, saved.hand_v
         self.local_outputs[: n + 1], self.pulls[: n + 1] = saved.outputs, saved.pulls
@@ -300,14 +301,22 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
         SolverError: a solve failed or missed its tolerance.
         ResourceError: the snapshots do not fit.
         CheckpointError: resume was asked for and no fitting restart file is there.
-        Interrupted: Ctrl-C or ``until``; the message names the restart file.
+        Interrupted: Ctrl-C or SIGTERM; Paused: ``until``; the message names the restart file.
+        SceneError: another run holds the folder into which this one would write.
 
     >>> import softgrasp as sg
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=60"])
     >>> sg.simulate(model).energy_drift < 1e-12
     True
     """
-    options = options or RunOptions()
+    options, kept = options or RunOptions(), model.scene.output
+    if kept.snapshots != "hdf5" and not (kept.checkpoint_every or options.resume or options.until is not None):
+        return _simulate(model, options, force)
+    with locked(model.system.layout.comm, options.directory):
+        return _simulate(model, options, force)
+
+
+def _simulate(model: Model, options: RunOptions, force: Force | None) -> Trajectory:
     run = Run(model, options, force)
     ts = make_ts(run)
     try:
@@ -372,6 +381,6 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
             if full:
                 raise ResourceError(f"{full}; {manifest} lets --resume go on from step {run.reached}")
             if stopped or run.reached == last:
-                raise Interrupted(
+                raise (Interrupted if stopped else Paused)(
                     f"stopped after step {run.reached} of {run.steps}; {manifest} lets --resume go on from there"
                 )

@@ -11,6 +11,7 @@ import numpy as np
 
 from softgrasp.fem.errors import CheckpointError, ResourceError, agree
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.resources import check_room, free_memory
 from softgrasp.fem.run.midpoint import TissueState, state_on
@@ -154,6 +155,7 @@ class Hdf5Store(NoStore):
         path, shape = self.path, (len(self.steps), rows)
         if run is not None:
             try:
+                note(path)
                 with h5py.File(path, "w") as file:
                     file.create_dataset("Z", shape, dtype="f8", chunks=(1, max(rows, 1)), fletcher32=True)
                     file.attrs["written"], file.attrs["run"] = 0, run
@@ -233,6 +235,7 @@ class Hdf5Store(NoStore):
     def _join(self, sizes: list[int], nodes: list[Array], times: Array, q: Array, v: Array) -> None:
         path, count = self.directory / "snapshots.h5", len(self.steps)
         try:
+            note(path)
             with h5py.File(path, "w") as file:
                 for key, part in (("z", 0), ("v", 1)):
                     joined = h5py.VirtualLayout((count, sum(sizes)), dtype="f8")

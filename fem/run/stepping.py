@@ -87,7 +87,7 @@ class Stepped(ABC):
             cause = error.__cause__
             if cause is not None and not isinstance(cause, SoftgraspError):
                 raise cause from error  # a bug, perhaps on this rank alone: the command must end all ranks
-            if cause is None and self.midpoint.held.whole and self.layout.comm.size > 1:
+            if cause is None and self.midpoint.operators.whole and self.layout.comm.size > 1:
                 raise  # of this rank alone, while the others step on: the command must end all ranks
             text = str(cause) if cause is not None else f"PETSc error {error.ierr}"
             t = (self.reached + 1) * self.dt

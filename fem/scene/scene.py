@@ -9,6 +9,7 @@ and the path in front of them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -182,6 +183,14 @@ class Scene(Section):
     def time_end(self) -> float:
         """End time [s]."""
         return self.motion.duration if self.time.end is None else self.time.end
+
+    def changed(self, edit: Callable[[dict[str, Any]], None]) -> Scene:
+        """A copy after ``edit`` changed the table of its keys in place. Raises ValidationError: it is no scene then."""
+        data = self.model_dump(mode="json", by_alias=True, exclude_none=True)
+        edit(data)
+        result = Scene.model_validate(data)
+        result._directory = self._directory
+        return result
 
     def path(self, name: str) -> Path:
         """A file named in the scene, absolute."""

@@ -9,11 +9,11 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc, to_scipy
 from softgrasp.fem.strain.compiled import LANES, library
 from softgrasp.fem.strain.laws import LAWS, Start, double_dot, green, stretches, volume_change
 from softgrasp.fem.strain.points import Points
-from softgrasp.fem.system import LayerMaterial
 
 DECLARATION = """
 void softgrasp_start(int d, int k, int p, const int *node, const double *G, const double *z, double *H0, double *j0,

@@ -6,18 +6,15 @@ f(z) = B' (vol P(B z)) and K(z) = B' (vol A(B z)) B, for any element order, dime
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc, rows_on_all, to_scipy, whole_copy
 from softgrasp.fem.strain.laws import LAWS, Law, LawName
-
-if TYPE_CHECKING:
-    from softgrasp.fem.system import LayerMaterial
 
 Ints = NDArray[np.intp]
 

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softgrasp.fem.checksums import write_arrays
 from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.sealed import write_arrays
 from softgrasp.lqr.loop.small import SmallPlant
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
@@ -242,6 +243,7 @@ def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Pat
     path = _named(path)
     fresh = path.with_name("new-" + path.name)
     try:
+        note(path)
         write_arrays(fresh, {"meta": np.array(json.dumps(meta)), **arrays})
         fresh.replace(path)
     except OSError as error:

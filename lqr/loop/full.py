@@ -15,7 +15,7 @@ from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.hand import HandStep
-from softgrasp.fem.run.midpoint import make_midpoint
+from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.snapshots import Snapshots, make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.solve.solvers import Reproducible, SolverUsed, choose_solver

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.checksums import digest, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
 from softgrasp.fem.errors import CheckpointError, SolverError, agree
 from softgrasp.fem.petsc import Array, on_root
-from softgrasp.fem.sealed import digest, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
 from softgrasp.lqr.lowrank.adi import SHARE, AdiSweep, FactorColumns, adi_step, sweep_norms
 from softgrasp.lqr.lowrank.adjoint import Right, make_right
 from softgrasp.lqr.lowrank.compress import triangular

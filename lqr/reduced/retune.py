@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.lqr.dense.care import StateSpace, solve_reduced
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem

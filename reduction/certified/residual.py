@@ -21,10 +21,11 @@ from mpi4py import MPI
 from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc, times_columns, total
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
-from softgrasp.fem.system import BlockSystem, LayerMaterial
+from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.galerkin import unit_coupling
 
 DEPENDENT = 1e-8  # of the longest mode: shorter rests are not sure to be orthogonal to a residual

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from softgrasp.fem.accuracy import estimate as accuracy
-from softgrasp.fem.accuracy.small import reduced
+from softgrasp.fem.accuracy.krylov import krylov_model
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, build
@@ -25,7 +25,7 @@ from softgrasp.reduction.certified.model import Box, CertifiedModel
 from softgrasp.reduction.certified.motion import Materials
 from softgrasp.reduction.certified.residual import ResidualSpace
 from softgrasp.reduction.certified.training import certified_model, scene_drive
-from softgrasp.reduction.certified.truth import tested
+from softgrasp.reduction.certified.validation import tested
 from softgrasp.reduction.parameters import box_of, materials_at, outside, run_with, thinned
 
 COLUMNS = 200  # states of a full run that its modes are taken from
@@ -343,7 +343,7 @@ def mesh_number(model: Model, places: Sequence[Materials]) -> MeshNumber:
     estimates = []
     for place in places:
         systems = ((m, m.system.with_materials(place)) for m in (model, other))
-        pair = [reduced(replace(m, system=system)) for m, system in systems]
+        pair = [krylov_model(replace(m, system=system)) for m, system in systems]
         estimates.append(accuracy.difference(pair[0], pair[1])[0])
     return MeshNumber(tuple((place[0].lam, place[0].mu) for place in places), tuple(estimates))
 

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.model import ModelError, Outputs
 from softgrasp.reduction.online import ReducedTrajectory, checked_hand
 from softgrasp.reduction.strain.cells import Cells, Potential
@@ -206,6 +207,7 @@ class StrainModel:
     layout: BlockLayout | None = None
     Phi: Array | None = None
     scene_hash: str = ""  # of the scene it was made for
+    origin: dict[str, Any] = field(default_factory=dict)  # of `reduction.origin`, what that scene says of a run; or {}
     seconds: dict[str, float] = field(default_factory=dict)  # offline, by stage
 
     @property

@@ -36,9 +36,10 @@ from softgrasp.reduction.errors import column_blocks, ratio
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.operators import Reconstruction, layer_products, symmetric
+from softgrasp.reduction.origin import origin_of
 from softgrasp.reduction.parameters import thinned
 from softgrasp.reduction.projection import project_outputs
-from softgrasp.reduction.replay import FullRun
+from softgrasp.reduction.replay import FullRun, check_scenes
 from softgrasp.reduction.strain.cells import Cells, Potential
 from softgrasp.reduction.strain.model import SmallStrainModel, StrainModel, StrainRun, TrainedBox, coordinates
 from softgrasp.reduction.strain.nnls import nnls, on_one_rank
@@ -162,6 +163,7 @@ class Training:
         return StrainModel(
             self.cells, K_mu, K_lambda, G, system.materials, outputs, self._box(), count, system.damping.alpha,
             system.damping.in_space, system.gravity, layout=layout, Phi=Phi, scene_hash=self.model.scene_hash,
+            origin=origin_of(self.model.scene_keys),
         )  # fmt: skip
 
     def _box(self) -> TrainedBox:
@@ -326,8 +328,12 @@ def train(model: Model, runs: Sequence[FullRun], N: int) -> Training:
     return Training(model, fulls, Phi, cells, offset, tuple(reference_of(run, Phi) for run in fulls), seconds)
 
 
-def replay_strain(rom: StrainModel, full: FullRun, *, outside: bool = False) -> StrainRun:
-    """Under the hand of a full run, see :func:`softgrasp.reduction.reduce.replay`. Collective."""
+def replay_strain(rom: StrainModel, full: FullRun, model: Model | None = None, *, outside: bool = False) -> StrainRun:
+    """Under the hand of a full run, see :func:`softgrasp.reduction.reduce.replay`. Collective.
+
+    ``model``: a scene that is to fit beside that of the run, or None.
+    """
+    check_scenes(rom.origin, "finite strain", model or full.model, full)
     return _replay(rom.at(full.dt, full.model.system.materials, outside=outside), full)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from rich.progress import Progress, TaskProgressColumn
 
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.fem.owned import remove_own
 from softgrasp.fem.scene.control import Loop
 from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import Design, design
@@ -24,15 +24,17 @@ from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control import measure, report
 from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
-from softgrasp.study.pictures.beside import beside
+from softgrasp.study.pictures.background import draw_in_background
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import pairs
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Flags, Page, Session, list_files
 
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 
 
+@folder_lock()
 def run_control(
     path: Path, out: Path, overrides: list[str], console: Console, *, gain_only: bool = False, **flags: Unpack[Flags]
 ) -> dict[str, Any]:
@@ -85,7 +87,7 @@ def run_control(
 
     list_files(console, session.write(model.scene, result, page))
     if session.comm.rank == 0 and restart is not None:
-        shutil.rmtree(restart, ignore_errors=True)
+        remove_own(out, restart)
     session.comm.Barrier()
     return result
 
@@ -161,7 +163,7 @@ def _drawn(session: Session, study: ControlStudy, frames: Frames) -> Callable[[]
 
         return draw_all(out, study, poles, frames)
 
-    return beside(session.comm, session.out, draw)
+    return draw_in_background(session.comm, session.out, draw)
 
 
 def unused_rate(model: Model) -> str:

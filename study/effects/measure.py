@@ -20,16 +20,15 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.checksums import digest
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.run.simulate import Run, RunOptions
-from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.sealed import digest
 from softgrasp.fem.solve.solvers import ITERATIVE
 from softgrasp.study.effects.result import Cost, OffProof
-from softgrasp.study.effects.switch import changed, neutral
-from softgrasp.study.shell.timing import interleave, medians, rotated
+from softgrasp.study.effects.switch import neutral
+from softgrasp.study.shell.timing import RepeatableRun, interleave, medians, rotated
 
 BURSTS = 7  # short ones make a sample by their median, so that a busy moment of the machine falls out
 BURST_SECONDS = 0.02  # of the steps of one; long against the timer
@@ -55,56 +54,9 @@ class MeasuredScene:
     objects_in_steps: dict[str, int] = field(default_factory=dict)  # the same of the next steps
 
 
-class RepeatableRun:
-    """A run that can be taken back to its start, to time its steps any number of times. Collective."""
-
-    def __init__(self, model: Model) -> None:
-        self.comm: MPI.Intracomm = model.system.layout.comm
-        self.run = Run(model, RunOptions())
-        self.ts = make_ts(self.run)
-        self.run.start()
-        self.begin = self.run.state.array.copy()
-
-    def rewind(self) -> None:
-        """Back to step 0. Collective."""
-        run = self.run
-        run.state.array[:] = self.begin
-        run.state.z.stateIncrease()
-        run.state.v.stateIncrease()
-        run.midpoint.start(run.state)
-        run.midpoint.dissipated = 0.0
-        run.reached = 0
-        self.ts.setStepNumber(0)
-
-    def seconds_per_step(self, count: int) -> float:
-        """Seconds of a step on the slowest rank, over at least ``count`` steps. Collective."""
-        run, before, done = self.run, self.run.seconds, 0
-        while done < count:
-            self.rewind()
-            n = min(run.steps, count - done)
-            self.comm.Barrier()
-            run.advance_to(self.ts, n)
-            done += n
-        return float(self.comm.allreduce(run.seconds - before, MPI.MAX)) / done
-
-    def flops(self) -> float:
-        """Operations that PETSc counts in one step, over all ranks. Collective."""
-        self.rewind()
-        few, many = min(1, self.run.steps), min(11, self.run.steps)
-        self.run.advance_to(self.ts, few)
-        before = PETSc.Log.getFlops()
-        self.run.advance_to(self.ts, many)
-        return float(self.comm.allreduce(PETSc.Log.getFlops() - before)) / max(many - few, 1)
-
-    def destroy(self) -> None:
-        """Free the PETSc objects. Collective."""
-        self.ts.destroy()
-        self.run.midpoint.destroy()
-
-
 def bare_output(scene: Scene) -> Scene:
     """The scene without snapshots: their memory and copies belong to no effect."""
-    return changed(scene, lambda table: table["output"].update(snapshots="none"))
+    return scene.changed(lambda table: table["output"].update(snapshots="none"))
 
 
 # --- hashes and memory
@@ -143,7 +95,7 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
     system, comm, midpoint = model.system, model.system.layout.comm, run.midpoint
     holders: list[tuple[str, Any]] = [("", system), ("", system.damping), ("step.", midpoint), ("hand.", run.drive)]
     holders.append(("hand.", getattr(run.drive, "step", None)))
-    holders += [("step.", midpoint.held), ("step.order.", midpoint.held.order)]
+    holders += [("step.", midpoint.operators), ("step.order.", midpoint.operators.order)]
     holders += [("points.", system.points), ("points.", getattr(midpoint, "body", None))]
     for layer in system.layers:
         holders += [(f"{key}[{layer.name}].", getattr(layer, key)) for key in ("K_mu", "K_lambda", "M_1")]

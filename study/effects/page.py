@@ -13,10 +13,9 @@ from matplotlib.patches import Patch
 
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.result import EffectResult, EffectsStudy
-from softgrasp.study.forward.accuracy import percent
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, OUTLINE, WIDTH, paper_style, save
 from softgrasp.study.report.page import Section
-from softgrasp.study.report.tables import Columns, Table, listed, table_of
+from softgrasp.study.report.tables import Columns, Table, listed, percent, table_of
 from softgrasp.study.shell.session import Page, Session
 
 CAPTION = (

@@ -14,9 +14,9 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.errors import ResourceError, SolverError
-from softgrasp.fem.fields.scales import rigid_inertia
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import free_bytes, size_text
+from softgrasp.fem.model.scales import rigid_inertia
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, ends, measure_builds, measure_steps, objects_of
@@ -34,6 +34,7 @@ from softgrasp.study.effects.verdict import (
 )
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Session, list_files
 
 TIMER = 0.03  # relative difference of two equal runs that cache and page placement can leave in every sample
@@ -133,6 +134,7 @@ def check_variants(scene: Scene, comm: MPI.Intracomm, explanation: Explanation, 
         )
 
 
+@folder_lock()
 def run_effects(
     path: Path, out: Path, overrides: list[str], console: Console, *, quiet: bool = False, empty: bool = False
 ) -> dict[str, Any]:

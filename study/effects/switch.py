@@ -6,7 +6,7 @@ An effect that is on is taken out; one that is off is put in with a trial value 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,15 +43,6 @@ class Switch:
     unit: str = ""  # of the strength
 
 
-def changed(scene: Scene, edit: Callable[[Table], None]) -> Scene:
-    """A copy of the scene after ``edit`` changed its table in place."""
-    data = scene.model_dump(mode="json", by_alias=True, exclude_none=True)
-    edit(data)
-    result = Scene.model_validate(data)
-    result._directory = scene.directory
-    return result
-
-
 def switches(scene: Scene, scales: Scales) -> tuple[Switch, ...]:
     """Every effect with the scene in which it is switched the other way."""
     return tuple(switch(scene, name, scales) for name in EFFECTS)
@@ -78,13 +69,13 @@ def switch(scene: Scene, name: str, scales: Scales) -> Switch:
             table["hand"] |= {} if on else {"inertia": _hand_inertia(scene, scales)}
             _resize(table, d, d if on else d + len(scales.inertia))
 
-    return Switch(name, on, value, changed(scene, edit), "", strength, unit)
+    return Switch(name, on, value, scene.changed(edit), "", strength, unit)
 
 
 def neutral(scene: Scene, name: str, d: int) -> Scene | None:
     """The scene with the effect named but of strength zero; None for effects that know no strength."""
     zero = {"gravity": {"g": [0.0] * d}, "damping": {"kind": "kelvin-voigt", "beta": 0.0}}
-    return changed(scene, lambda table: table["effects"].update({name: zero[name]})) if name in zero else None
+    return scene.changed(lambda table: table["effects"].update({name: zero[name]})) if name in zero else None
 
 
 def _obstacle(scene: Scene, name: str, scales: Scales) -> str:

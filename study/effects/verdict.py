@@ -21,11 +21,10 @@ from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.measure import AGAIN, SCENE, MeasuredScene, cost_of, prove_off
 from softgrasp.study.effects.result import Change, Company, Cost, EffectResult, Elements
-from softgrasp.study.effects.switch import Scales, Switch, changed, switch
-from softgrasp.study.forward.accuracy import percent
+from softgrasp.study.effects.switch import Scales, Switch, switch
 from softgrasp.study.forward.cautions import LOCKING
 from softgrasp.study.forward.explain import EffectReport, Explanation
-from softgrasp.study.report.tables import listed
+from softgrasp.study.report.tables import listed, percent
 
 Names = frozenset[str]
 Changes = dict[str, tuple[Change, float | None]]  # of the outputs, and under a force
@@ -339,4 +338,4 @@ def quadratic(model: Model) -> Scene:
             if entry["kind"] == "node":
                 entry["point"] = list(output.point)
 
-    return changed(model.scene, edit)
+    return model.scene.changed(edit)

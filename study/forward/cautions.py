@@ -6,8 +6,8 @@ import numpy as np
 
 from softgrasp.fem.effects.finite_strain import linear_error
 from softgrasp.fem.effects.gate import SMALL_SHARE
-from softgrasp.fem.fields.scales import SMALL_STRAIN, gradient, magnified, slowest
 from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.scales import SMALL_STRAIN, gradient, magnified, slowest
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.materials import young_poisson

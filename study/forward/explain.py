@@ -11,11 +11,11 @@ from mpi4py import MPI
 
 from softgrasp.fem.effects import EFFECTS, Gate
 from softgrasp.fem.effects.gate import SMALL_SHARE, Sag
-from softgrasp.fem.fields.scales import SMALL_STRAIN, measure
 from softgrasp.fem.mesh.singular import expected_order
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.memory import Need, factor_bytes, need
 from softgrasp.fem.model.refined import by_lines, scene_ends
+from softgrasp.fem.model.scales import SMALL_STRAIN, measure
 from softgrasp.fem.run.motion import largest_acceleration
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes

@@ -10,19 +10,20 @@ from rich.markup import escape
 from rich.padding import Padding
 
 from softgrasp.fem.effects.gate import SMALL_SHARE
-from softgrasp.fem.fields.scales import SMALL_STRAIN
 from softgrasp.fem.model.memory import size_text
-from softgrasp.study.forward.accuracy import percent
+from softgrasp.fem.model.scales import SMALL_STRAIN
 from softgrasp.study.forward.explain import EffectReport, Explanation, MeshReport, explain
 from softgrasp.study.report.origin import origin
 from softgrasp.study.report.page import EQUATION, Section
-from softgrasp.study.report.tables import Table, listed
+from softgrasp.study.report.tables import Table, listed, percent
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Page, Session, list_files
 
 EFFECTS = ("effect", "verdict", "gate", "number", "matters from", "what it says")
 COSTS = ("effect", "adds", "allocates", "cost")
 
 
+@folder_lock()
 def run_explain(
     path: Path, out: Path | None, overrides: Sequence[str], console: Console, *, empty: bool = False
 ) -> Explanation:

@@ -12,16 +12,18 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.errors import Interrupted, ResourceError, SceneError, SolverError
+from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError, SolverError
 from softgrasp.fem.mesh.check import counted
+from softgrasp.fem.run.checkpoint import check_ranks
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, draw, estimate_error
+from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estimate_error
 from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.page import Section, captioned, of_scene
 from softgrasp.study.report.tables import pairs
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Flags, Page, Session, list_files, show_warnings
 
 CAPTIONS = {
@@ -32,6 +34,7 @@ CAPTIONS = {
 }
 
 
+@folder_lock()
 def run_simulate(
     path: Path,
     out: Path,
@@ -43,13 +46,15 @@ def run_simulate(
     certify: bool = False,
     **flags: Unpack[Flags],
 ) -> dict[str, Any]:
-    """Simulate a scene file and write its results. Collective."""
+    """Simulate a scene file and write its results; nothing comes back of a run that ``until`` stops. Collective."""
     if resume and flags.get("empty"):
         raise SceneError("--empty removes what --resume goes on from; give one of them")
     session = Session("simulate", path, overrides, out, console, **flags)
     scene = session.scene()
     if certify and scene.effects.finite_strain is not None:
         raise SceneError(f"{NOT_LINEAR}: leave out --certify, or set effects.finite_strain to false")
+    if resume:
+        check_ranks(session.comm, out / "checkpoint")
     model = session.model(scene)
     scene, frames = model.scene, Frames(model, out, session.pictures)
 
@@ -69,10 +74,13 @@ def run_simulate(
         options = RunOptions(out, resume, until, progress, frames, join, frames.keep)
         try:
             run = simulate(model, options)
-        except (Interrupted, ResourceError):
+        except (Interrupted, ResourceError) as stopped:
             if files := frames.close():
                 list_files(console, files)
-            raise
+            if not isinstance(stopped, Paused):
+                raise
+            console.print(str(stopped), soft_wrap=True, markup=False)
+            return {}
     fields = frames.close()
     result = simulate_result(model, run, run_warnings(model, run, frames.most[1:]))
     tables = {"trajectory.csv": result.trajectory()}
@@ -85,7 +93,9 @@ def run_simulate(
     def page() -> Page:
         drawn = frames.draw(out, run)
         if session.pictures and mesh_error is not None:
-            drawn += draw(out / "mesh_error.png", run, mesh_error)
+            from softgrasp.study.forward.plots import figure_mesh_error  # brings Matplotlib
+
+            drawn += figure_mesh_error(out / "mesh_error.png", run, mesh_error)
         sections = _sections(result, rows, drawn)
         return Page(scene.name, [*result.summary(), *accuracy.summary], sections, tables, [*fields, *drawn])
 

@@ -16,6 +16,7 @@ from PIL import Image
 
 from softgrasp.fem.columns import Array
 from softgrasp.fem.fields.picture import PictureMesh
+from softgrasp.fem.owned import note
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, legend, make_axes, make_shot, name_layers
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.pictures.style import TARGET, colour_map, paper_style
@@ -130,6 +131,7 @@ def write_gif(images: list[Any], durations: list[int], out_gif: Path) -> Path:
         first.save(buffer, format="GIF", save_all=True, append_images=rest, duration=durations, loop=0, optimize=False)
         if buffer.tell() <= MOST_BYTES:
             break
+    note(out_gif)
     out_gif.write_bytes(buffer.getvalue())
     return out_gif
 

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
 
+from softgrasp.fem.checksums import AGAIN, read_arrays, write_arrays
 from softgrasp.fem.errors import CheckpointError, agree
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
 from softgrasp.fem.fields.series import SeriesWriter
 from softgrasp.fem.fields.vtu import note_of
 from softgrasp.fem.model.build import Model
+from softgrasp.fem.owned import remove_own
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import Run, frame_steps
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.fem.sealed import AGAIN, read_arrays, write_arrays
 from softgrasp.study.pictures.shapes import way_done
 
 MANY_VERTICES = 200_000  # above, only the instants of the still picture are kept
@@ -70,8 +70,7 @@ class Frames:
             if path.stem in own and note_of(path) == run.name:
                 continue
             self.foreign = self.foreign or path.stem in own
-            shutil.rmtree(path.with_suffix(""), ignore_errors=True)
-            path.unlink()
+            remove_own(self.directory, path.with_suffix(""), path)
 
     def _load(self, run: Run) -> None:
         frames = [
@@ -149,7 +148,7 @@ class Frames:
         if self.picture is None or not self.states:
             return []
         from softgrasp.study.pictures.animation import gif_move  # these bring Matplotlib
-        from softgrasp.study.pictures.beside import beside
+        from softgrasp.study.pictures.background import draw_in_background
         from softgrasp.study.pictures.body import figure_move
         from softgrasp.study.pictures.traces import figure_traces
 
@@ -159,7 +158,7 @@ class Frames:
         def moving(out: Path) -> list[Path]:
             return [] if self.few else [gif_move(picture, states, times, table, target, out / "move.gif")]
 
-        moved = beside(self.model.system.layout.comm, directory, moving)
+        moved = draw_in_background(self.model.system.layout.comm, directory, moving)
         files = [*figure_move(picture, states, times, table, target, directory / "move.png")]
         files += figure_traces(
             run.times, run.outputs, run.columns, run.q_s, directory / "traces.png", rigid=run.outputs_rigid,

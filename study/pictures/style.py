@@ -12,6 +12,7 @@ import matplotlib as mpl
 import numpy as np
 from cycler import cycler
 
+from softgrasp.fem.owned import note
 from softgrasp.study.pictures import PDF
 
 mpl.use("Agg")
@@ -26,6 +27,7 @@ OUTLINE = "#555555"
 TARGET = ORANGE
 CYCLE = (BLUE, ORANGE, GREEN, PURPLE)
 COLUMN, WIDTH = 3.4, 7.0  # [inch], one column and both of a two-column page
+FULL: dict[str, Any] = {"color": "#888888", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}  # a full run beside reduced ones
 DPI = 150
 STEPS = [1, 2, 5, 10]  # between ticks
 
@@ -100,6 +102,7 @@ def direct_labels(ax: Any, ends: Sequence[tuple[float, float, str, str]], size: 
 def save(figure: Any, out_png: Path) -> tuple[Path, ...]:
     """Write the figure as PNG and, where :data:`PDF` is set, beside it as PDF; close it and return the names."""
     files = (out_png, out_png.with_suffix(".pdf")) if PDF.get() else (out_png,)
+    note(*files)
     for file in files:
         figure.savefig(file, bbox_inches="tight", pad_inches=0.04)
     plt.close(figure)

@@ -12,7 +12,7 @@ from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.points import ForwardPoint, ReducedPoint, RunPoint
 from softgrasp.study.precision.predict import SAFETY, Prediction, Predictor
 from softgrasp.study.precision.reduced import ReducedRuns
-from softgrasp.study.precision.result import Answer, Choice, Truth
+from softgrasp.study.precision.result import Answer, Choice, ReferenceSolution
 from softgrasp.study.precision.settings import Setting
 
 TRIES = 4  # settings that are run to check a prediction
@@ -36,21 +36,6 @@ def parse_budget(text: str) -> float:
         value = 0.0
     if not 0 < value < float("inf"):
         raise SceneError(f"--budget {text}: it must be a time > 0 with its unit, such as 1ms, 500us or 0.01s")
-    return value
-
-
-def parse_tolerance(text: str | float) -> float:
-    """A relative tolerance such as ``1e-3``.
-
-    Raises:
-        SceneError: it is no number between 0 and 1.
-    """
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < 1:
-        raise SceneError(f"--tolerance {text}: it must be a number between 0 and 1, such as 1e-3")
     return value
 
 
@@ -80,7 +65,7 @@ class Answers:
     """Answers for one study; ``measured`` are the points that were made for them. Its methods are collective."""
 
     def __init__(
-        self, runs: FullRuns, truth: Truth, forward: Sequence[ForwardPoint], reduced: Sequence[ReducedPoint]
+        self, runs: FullRuns, truth: ReferenceSolution, forward: Sequence[ForwardPoint], reduced: Sequence[ReducedPoint]
     ) -> None:
         self.scene, self.runs, self.truth = runs.scene, runs, truth
         self.forward, self.reduced = forward, reduced

@@ -16,6 +16,7 @@ from mpi4py import MPI
 from softgrasp import package_version
 from softgrasp.fem.errors import Interrupted, agree
 from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.files import to_json
@@ -85,6 +86,7 @@ class Cache:
     def _write(self, path: Path, data: dict[str, Any]) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part")
+        note(part, path)
         part.write_text(json.dumps(data))
         os.replace(part, path)  # a file is there whole or not at all
 

@@ -10,7 +10,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.full import FullRuns, TimedRun, errors_of
 from softgrasp.study.precision.points import ForwardPoint
-from softgrasp.study.precision.result import Question, Truth
+from softgrasp.study.precision.result import Question, ReferenceSolution
 from softgrasp.study.precision.settings import (
     GOALS,
     LEAST_STEPS,
@@ -54,7 +54,7 @@ def solver_settings(scene: Scene, steps: int | None = None) -> list[Setting]:
     return solvers + [replace(base, solver="cg", rtol=rtol) for rtol in CG_TOLERANCES]
 
 
-def to_point(setting: Setting, run: TimedRun, truth: Truth, finest: TimedRun | None = None) -> ForwardPoint:
+def to_point(setting: Setting, run: TimedRun, truth: ReferenceSolution, finest: TimedRun | None = None) -> ForwardPoint:
     """A run as a point of the diagram; ``finest`` is the run with the most steps on its mesh, when this is not it."""
     error, displacement = errors_of(run.series, truth.series)
     change = None if finest is None else errors_of(run.series, finest.series)[0]
@@ -66,7 +66,7 @@ def to_point(setting: Setting, run: TimedRun, truth: Truth, finest: TimedRun | N
     )  # fmt: skip
 
 
-def ask_forward(runs: FullRuns, truth: Truth, ends: Ends) -> Question:
+def ask_forward(runs: FullRuns, truth: ReferenceSolution, ends: Ends) -> Question:
     """Run all settings of the diagram. Collective."""
     points = list(_points(runs, truth))
     slopes = forward_slopes(points, truth, orders(runs.scene, ends, runs.dimension))
@@ -79,7 +79,7 @@ def orders(scene: Scene, ends: Ends, d: int) -> dict[tuple[int, bool], float]:
     return {(p, graded): expected_order(ends, p, graded, edges) for p in ORDERS for graded in (False, True)}
 
 
-def _points(runs: FullRuns, truth: Truth) -> Iterator[ForwardPoint]:
+def _points(runs: FullRuns, truth: ReferenceSolution) -> Iterator[ForwardPoint]:
     """Graded meshes and the scene's own with all numbers of steps, even ones with few. Collective."""
     scene, d = runs.scene, runs.dimension
     own = own_setting(scene)
@@ -139,7 +139,7 @@ def over_steps(points: Sequence[ForwardPoint]) -> dict[str, list[ForwardPoint]]:
 
 
 def forward_slopes(
-    points: Sequence[ForwardPoint], truth: Truth, expected: dict[tuple[int, bool], float]
+    points: Sequence[ForwardPoint], truth: ReferenceSolution, expected: dict[tuple[int, bool], float]
 ) -> list[Slope]:
     """Orders: of the error in n_e^(1/d), of the change in the steps, of time in the unknowns.
 

@@ -16,7 +16,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.interpolate import CubicSpline
 
-from softgrasp.fem.accuracy.adapt import build_to_tolerance
+from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.fields.probe import Probe, make_probe
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.outputs import make_outputs
@@ -251,7 +251,7 @@ class FullRuns:
         scene = self.variant(setting)
         if setting.refine == "scene":  # one mesh whatever the steps, which its passes depend on a little
             scene = self.variant(own_setting(self.scene))
-        make = build_to_tolerance if setting.refine == "scene" else build
+        make = adapt.build if setting.refine == "scene" else build
         forms = setting.order, make
         if forms not in self._compiled:
             make(scene, comm=comm)

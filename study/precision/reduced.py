@@ -25,10 +25,10 @@ from softgrasp.reduction.replay import FullRun, full_run, replay_inputs
 from softgrasp.study.precision.fit import slopes
 from softgrasp.study.precision.full import FullRuns, Series, errors_of
 from softgrasp.study.precision.points import BasisPoint, ReducedPoint
-from softgrasp.study.precision.result import Question, Truth
+from softgrasp.study.precision.result import Question, ReferenceSolution
 from softgrasp.study.precision.settings import Setting
-from softgrasp.study.reduce.measure import bases_of, chosen_methods, measured
-from softgrasp.study.reduce.result import Point
+from softgrasp.study.reduce.linear.measure import bases_of, chosen_methods, measured
+from softgrasp.study.reduce.linear.result import Point
 from softgrasp.study.shell.timing import repeated
 
 CALLS = 2_000  # single steps of a reduced model that are timed
@@ -53,7 +53,7 @@ class TimedModel(Point):
 class ReducedRuns:
     """Reduced models of one mesh and step; the full run is made again when the cache lacks a point. Collective."""
 
-    def __init__(self, setting: Setting, runs: FullRuns, truth: Truth) -> None:
+    def __init__(self, setting: Setting, runs: FullRuns, truth: ReferenceSolution) -> None:
         self.scene, self.setting, self.runs, self.truth = runs.scene, setting, runs, truth
         self.timed = runs.run(setting)  # the full run behind the models, without its snapshots
         self._full: tuple[FullRun, Probe] | None = None

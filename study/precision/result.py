@@ -21,7 +21,7 @@ ADVICE = {
 
 
 @dataclass(frozen=True)
-class Truth:
+class ReferenceSolution:
     """The reference solution with its error estimate, relative to the largest deformation and displacement."""
 
     series: Series  # the solution
@@ -89,24 +89,13 @@ class ReducedReference:
 
 
 @dataclass(frozen=True)
-class LoopReference:
-    """The optimal loop without a time step."""
-
-    error: float | None  # change of the outputs with half of the modes
-    modes: int  # of the tissue
-    complete: bool  # all there are
-    optimal: float  # cost from the scene's start
-    to_come: float  # of it, after the end of the run
-
-
-@dataclass(frozen=True)
 class Question:
     """One question of a study."""
 
     points: tuple[WorkPoint, ...] = ()  # measured
     slopes: tuple[Slope, ...] = ()  # fitted to them
     # what the points are compared with; of reduced models and bases, the full run behind them
-    reference: Truth | TimedRun | RiccatiReference | ReducedReference | LoopReference | None = None
+    reference: ReferenceSolution | TimedRun | RiccatiReference | ReducedReference | None = None
     skipped: str = ""  # why there are no points; empty when there are some
 
     @property
@@ -206,7 +195,7 @@ class WorkStudy:
     """All that one study found."""
 
     scene: Scene  # the scene
-    truth: Truth | None  # solution that outputs are compared with; None when no question needed it
+    truth: ReferenceSolution | None  # solution that outputs are compared with; None when no question needed it
     questions: dict[str, Question]  # by name, in the order of softgrasp.study.precision.points.QUESTIONS
     answers: tuple[Answer, ...]  # to a tolerance and a budget
     # of the scene's own setting and of the one that answers; none without the forward question
@@ -240,7 +229,7 @@ class WorkStudy:
         references = {
             name: q.reference
             for name, q in self.questions.items()
-            if isinstance(q.reference, RiccatiReference | ReducedReference | LoopReference)
+            if isinstance(q.reference, RiccatiReference | ReducedReference)
         }
         result: dict[str, Any] = to_json(
             {

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.progress import TaskProgressColumn
 
-from softgrasp.fem.accuracy.adapt import build_to_tolerance
+from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.errors import ResourceError, SceneError, SolverError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.refined import scene_ends
@@ -23,20 +23,21 @@ from softgrasp.study.precision.answer import Answers
 from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.forward import SHARES, ask_forward, mesh_series, solver_settings
 from softgrasp.study.precision.full import FullRuns, find_places
-from softgrasp.study.precision.loop import CONTROLLERS, ask_loop
 from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RunPoint
 from softgrasp.study.precision.predict import Predictor, error_budget
 from softgrasp.study.precision.reduced import ReducedRuns, ask_bases, ask_reduced
-from softgrasp.study.precision.result import Answer, ErrorBudget, Question, Truth, WorkStudy
+from softgrasp.study.precision.reference import LADDER, make_reference
+from softgrasp.study.precision.result import Answer, ErrorBudget, Question, ReferenceSolution, WorkStudy
 from softgrasp.study.precision.riccati import ControlRuns, ask_reduced_riccati, ask_riccati, settings_of
 from softgrasp.study.precision.settings import own_setting, variant
-from softgrasp.study.precision.truth import LADDER, make_truth
-from softgrasp.study.reduce.measure import chosen_methods
+from softgrasp.study.reduce.linear.measure import chosen_methods
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Session
 
 FULL_SNAPSHOTS = 3e8  # entries; beyond them the scene's own run is too large for reduced models in memory
 
 
+@folder_lock()
 def run_study(
     path: Path,
     out: Path,
@@ -94,19 +95,19 @@ def study_scene(
     """
     request = request or Request()
     names = request.questions
-    model = build_to_tolerance(variant(scene, own_setting(scene)), comm)
+    model = adapt.build(variant(scene, own_setting(scene)), comm=comm)
     store = Cache(cache, comm, scene, progress)
     runs = FullRuns(scene, find_places(scene, model), model.system.layout.reference, store)
     control = ControlRuns(model, store, request.names)
     refused = control.refused() if set(names) & set(CONTROL) else ""
     questions = {name: Question(skipped=refused) for name in names if name in CONTROL}
-    truth: Truth | None = None
+    truth: ReferenceSolution | None = None
     answers: list[Answer] = []
     measured: list[RunPoint] = []
     with interruptible(False) as store.stop:
         store.count = count_points(scene, control, [name for name in names if not (refused and name in CONTROL)])
         if set(names) - set(CONTROL):
-            truth = make_truth(runs, request.tolerance)
+            truth = make_reference(runs, request.tolerance)
             questions |= forward_questions(model, runs, truth, names)
             answers, measured = answer(runs, truth, questions, request)
         if not refused:
@@ -124,7 +125,9 @@ def study_scene(
     )
 
 
-def forward_questions(model: Model, runs: FullRuns, truth: Truth, names: Sequence[str]) -> dict[str, Question]:
+def forward_questions(
+    model: Model, runs: FullRuns, truth: ReferenceSolution, names: Sequence[str]
+) -> dict[str, Question]:
     """Full model, reduced models, and bases. Collective."""
     questions = {}
     if "forward" in names:
@@ -143,7 +146,7 @@ def forward_questions(model: Model, runs: FullRuns, truth: Truth, names: Sequenc
 
 
 def answer(
-    runs: FullRuns, truth: Truth, questions: dict[str, Question], request: Request
+    runs: FullRuns, truth: ReferenceSolution, questions: dict[str, Question], request: Request
 ) -> tuple[list[Answer], list[RunPoint]]:
     """Answers to the tolerance and the budget, and the points that were measured for them. Collective."""
     if request.tolerance is None and request.budget is None:
@@ -173,9 +176,9 @@ def error_budgets(
 
 
 def control_questions(control: ControlRuns, names: Sequence[str]) -> dict[str, Question]:
-    """Riccati equation, reduced equations, closed loop; one that fails is left out with its reason. Collective."""
+    """Riccati equation and reduced equations; one that fails is left out with its reason. Collective."""
     questions = {}
-    asks = {"riccati": ask_riccati, "reduced_riccati": ask_reduced_riccati, "loop": ask_loop}
+    asks = {"riccati": ask_riccati, "reduced_riccati": ask_reduced_riccati}
     for name, ask in asks.items():
         if name in names:
             try:
@@ -194,7 +197,6 @@ def count_points(scene: Scene, control: ControlRuns, names: Sequence[str]) -> in
         "bases": 1 + len(ENGINES),
         "riccati": 1 + len(settings_of(control)),
         "reduced_riccati": 1 + len(BASES),
-        "loop": 1 + CONTROLLERS,
     }
     truth = len(LADDER) if set(names) - set(CONTROL) else 0
     return truth + sum(counts[name] for name in names) or 1

@@ -10,7 +10,6 @@ from typing import Any, Literal
 import numpy as np
 
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.effects.switch import changed
 
 LEAST_STEPS = 4  # of a run
 Refine = float | Literal["off", "scene"]
@@ -119,7 +118,7 @@ def variant(scene: Scene, setting: Setting, snapshots: str = "none", reference: 
         if reference is not None:
             table["hand"]["reference"] = list(reference)
 
-    return changed(scene, edit)
+    return scene.changed(edit)
 
 
 POINT_WORK = {2: 8e6, 3: 1e6}  # unknowns times steps of a point of the diagram

@@ -7,11 +7,10 @@ from typing import Any
 
 from softgrasp.reduction.certified.certificate import Certificate
 from softgrasp.reduction.certified.model import Box
-from softgrasp.study.forward.accuracy import percent
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.page import Section, captioned, write_report
-from softgrasp.study.report.tables import Table, listed
+from softgrasp.study.report.tables import Table, listed, percent
 
 CAPTIONS = {
     "answer.png": "Outputs against the hand with the band that the error bound leaves (often thinner than the line); "

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from softgrasp.fem.owned import note
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
 
@@ -31,11 +32,13 @@ def to_json(value: Any) -> Any:
 def write_scene(out: Path, scene: Scene) -> Path:
     """Write the resolved scene beside a result. Not collective: call on one rank."""
     path = out / "scene.toml"
+    note(path)
     path.write_text(resolved_toml(scene))
     return path
 
 
 def write_json(path: Path, result: dict[str, Any]) -> Path:
     """Write a result; what is not finite becomes null. Not collective: call on one rank."""
+    note(path)
     path.write_text(json.dumps(to_json(result), indent=2, allow_nan=False) + "\n")
     return path

@@ -15,6 +15,7 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
+from softgrasp.fem.owned import note
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.equation import Equation, equation
@@ -129,6 +130,7 @@ def write_report(
     )
     if address := outside(html):
         raise ValueError(f"the page needs more than itself: {address[0]}")
+    note(path)
     path.write_text(html, encoding="utf-8")
     return path
 

@@ -14,6 +14,7 @@ import rich.table
 from rich.console import Console
 from rich.markup import escape
 
+from softgrasp.fem.owned import note
 from softgrasp.study.report.page import NUMBERS, Section, cell_text
 
 Columns = Mapping[str, str | Callable[[Any], Any]]
@@ -39,6 +40,7 @@ class Table:
 
     def write_csv(self, path: Path) -> Path:
         """One line a row, numbers in full, nothing for None. Not collective: call on one rank."""
+        note(path)
         with path.open("w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(self.header)
@@ -136,3 +138,8 @@ def numeric(cell: Any) -> bool:
     if cell is None or cell in ("", "-") or (isinstance(cell, NUMBERS) and not isinstance(cell, bool)):
         return True
     return re.fullmatch(r"[<~]? ?[-+]?[\d.]+(e[-+]?\d+)?( ?%| [a-zA-Zµ/]{1,4})?( ?!)?", str(cell)) is not None
+
+
+def percent(share: float) -> str:
+    """A share as a percentage of two digits."""
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"

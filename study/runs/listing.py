@@ -19,7 +19,7 @@ from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import command_line
 from softgrasp.study.report.page import Section, write_report
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.folder import claim, read_result
+from softgrasp.study.shell.folder import claim, folder_lock, read_result
 from softgrasp.study.shell.session import list_files
 
 SHOWN = 30  # rows of numbers in a terminal; the CSV has all
@@ -120,14 +120,14 @@ def apart(traces: tuple[list[str], np.ndarray, np.ndarray] | None) -> str:
     return f"The trajectories differ by at most {' and '.join(f'{size:.2g} {unit}' for unit, size in most.items())}."
 
 
+@folder_lock()
 def run_compare(a: Path, b: Path, out: Path, console: Console, *, pictures: bool = True, empty: bool = False) -> None:
     """Print how two runs differ, and write compare.csv, result.json and a picture. Not collective.
 
     Raises SceneError: a folder holds no run, or the one to write into holds another.
     """
     comparison = compare(a, b)
-    claim(out, "compare", f"{a.name} {b.name}", empty=empty)
-    out.mkdir(parents=True, exist_ok=True)
+    claim(out, "compare", f"{a.name} {b.name}", inputs=(a, b), empty=empty)
     keys, numbers = comparison.keys, comparison.numbers
     for table, none in ((keys, "The scenes are the same."), (numbers, "The numbers are the same.")):
         shown = Table(table.header, table.rows[:SHOWN]).terminal(wrap=(0, 1, 2), width=console.width)

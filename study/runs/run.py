@@ -15,6 +15,7 @@ from softgrasp.study.report.origin import origin
 from softgrasp.study.report.page import SHOWN, Section, cell_text
 from softgrasp.study.report.tables import Table
 from softgrasp.study.runs.sweep import METHOD, Sweep, SweepPoint, parse_axis, run_sweep_points
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
 
 UNITS = {"energy_drift": "energy drift", "seconds": "time [s]"}
@@ -63,6 +64,7 @@ def summary(sweep: Sweep, points: Sequence[SweepPoint]) -> list[str]:
     return [*texts, f"One run took {median(point.numbers['seconds'] or 0.0 for point in good):.2g} s in the median."]
 
 
+@folder_lock()
 def run_sweep(
     path: Path,
     out: Path,

@@ -13,9 +13,10 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp import package_version
+from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.errors import Interrupted, SceneError, SoftgraspError
 from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.file import load_scene
@@ -112,7 +113,7 @@ class Runner:
     def at(self, scene: Scene) -> Model:
         """Model of a scene, by sums of the matrices that are there where only the material differs. Collective."""
         if self.model is None or not only_material(self.model.scene, scene):
-            self.model, self.rom = build(scene, comm=self.comm), None
+            self.model, self.rom = adapt.build(scene, comm=self.comm), None
         m = scene.tissue.material
         return self.model.with_materials(m.lam, m.mu, m.rho) if only_material(self.model.scene, scene) else self.model
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.owned import LIST, LOCK, begin_list, forget, hold, own_files, read_list, release, remove_own
+from softgrasp.fem.scene.text import read_text
 
 
 def default_folder(command: str, scene: Path) -> Path:
@@ -18,45 +20,78 @@ def default_folder(command: str, scene: Path) -> Path:
 
 def read_result(folder: Path) -> dict[str, Any]:
     """The ``result.json`` of a folder; empty where there is none of a command."""
+    file = folder / "result.json"
     try:
-        result = json.loads((folder / "result.json").read_text())
-    except (OSError, ValueError):
+        result = json.loads(read_text(file)) if file.is_file() else {}
+    except (OSError, ValueError, RecursionError):
         return {}
-    return result if isinstance(result, dict) and "command" in result else {}
+    return result if isinstance(result, dict) and isinstance(result.get("command"), str) else {}
+
+
+def files_of(result: dict[str, Any]) -> list[str]:
+    """The files that a result names; a result that another program wrote may hold anything there."""
+    files = result.get("files")
+    return [name for name in files if isinstance(name, str)] if isinstance(files, list) else []
 
 
 def remove_files(folder: Path, names: Iterable[str]) -> None:
-    """Remove files of a run before, which its result.json names, where they lie in its folder."""
-    for name in names:
-        file = folder / name
-        if file.is_file() and file.resolve().is_relative_to(folder.resolve()):
+    """Remove files of a run before, which its result.json names, as far as they are in the list of the folder."""
+    home, doomed = folder.resolve(), set(names)
+    for file in own_files(folder):
+        if file.relative_to(home).as_posix() in doomed:
             file.unlink()
 
 
-def claim(out: Path, command: str, scene: str, *, path: Path = Path(), empty: bool = False) -> None:
-    """Refuse a folder that holds the run of another scene or command, or empty it. Not collective: call on one rank.
+@contextmanager
+def folder_lock() -> Iterator[None]:
+    """Decorates a command: the folder that it claims is given back at its end, however it ends."""
+    try:
+        yield
+    finally:
+        release()
 
-    ``path``, the scene file, must not be removed. Raises SceneError: the folder is of another run, or of several.
+
+def claim(out: Path, command: str, scene: str, *, inputs: Iterable[Path] = (), empty: bool = False) -> None:
+    """Lock a folder, refuse the one of another scene or command, or empty it, and begin the list of its files.
+
+    Not collective: call on one rank; the lock ends with the command, see :func:`folder_lock`.
+    ``--empty`` removes what the list of the runs before names and nothing else; ``inputs``, files and folders that the
+    command reads, must not be among it.
+
+    Raises SceneError: another process runs in the folder, it is of another run, or it has no list.
     """
-    result = read_result(out)
+    hold(out)
+    try:
+        _settle(out, (command, scene), [path.resolve() for path in inputs], empty)
+        begin_list(command, scene)
+    except BaseException:
+        release()
+        raise
+
+
+def _settle(out: Path, wanted: tuple[str, str], inputs: list[Path], empty: bool) -> None:
+    owner, result = read_list(out)[0], read_result(out)
+    known = owner is not None
+    if owner is None and result:  # of a version that wrote no list
+        owner = result["command"], str(result.get("scene", ""))
     if not empty:
-        if result and (result["command"], result.get("scene", "")) != (command, scene):
-            owner = f" on {result['scene']}" if result.get("scene") else ""
+        if owner not in (None, wanted):
+            of = f" on {owner[1]}" if owner and owner[1] else ""
             raise SceneError(
-                f"--out {out}: it holds the results of {result['command']}{owner}; name another folder, or remove "
+                f"--out {out}: it holds the results of {owner[0] if owner else ''}{of}; name another folder, or remove "
                 "them with --empty"
             )
         return
-    if not out.exists() or not any(out.iterdir()):
+    if not known:
+        if any(path.name != LOCK for path in out.iterdir()):
+            raise SceneError(
+                f"--out {out}: --empty removes the files that the list {LIST} of a run names, but there is no such "
+                "list; name another folder, or remove the files by hand"
+            )
         return
-    if not result:
-        raise SceneError(f"--out {out}: --empty removes the results of a run, but there is no result.json of one")
-    home = out.resolve()
-    keep = [Path.cwd(), path.resolve(), *(p.parent for p in home.rglob("result.json") if p.parent != home)]
-    if inside := next((p for p in keep if p.is_relative_to(home)), None):
-        raise SceneError(f"--out {out}: --empty would also remove {inside}; name another folder")
-    for item in home.iterdir():
-        if item.is_dir() and not item.is_symlink():
-            shutil.rmtree(item)
-        else:
-            item.unlink()
+    for file in own_files(out):
+        if used := next((path for path in inputs if file == path or file.is_relative_to(path)), None):
+            raise SceneError(f"--out {out}: --empty would also remove {used}; name another folder")
+    remove_own(out)
+    (out / LIST).unlink(missing_ok=True)
+    forget()

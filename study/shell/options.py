@@ -25,6 +25,21 @@ def check_folder(out: Path | None) -> Path | None:
     return out
 
 
+def parse_tolerance(text: str | float) -> float:
+    """A relative tolerance such as ``1e-3``.
+
+    Raises:
+        SceneError: it is no number between 0 and 1.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1:
+        raise SceneError(f"--tolerance {text}: it must be a number between 0 and 1, such as 1e-3")
+    return value
+
+
 def _pdf(pdf: bool) -> bool:
     from softgrasp.study.pictures import PDF
 

@@ -19,13 +19,14 @@ from rich.text import Text
 
 from softgrasp.fem.errors import agree
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.scene.file import load_scene_collective
+from softgrasp.fem.owned import follow
+from softgrasp.fem.scene.file import find_scene, load_scene_collective
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.files import write_json, write_scene
 from softgrasp.study.report.origin import command_line
 from softgrasp.study.report.page import Section, write_report
 from softgrasp.study.report.tables import Table, show_sections
-from softgrasp.study.shell.folder import claim, read_result, remove_files
+from softgrasp.study.shell.folder import claim, files_of, read_result, remove_files
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,10 @@ class Session:
         scene = load_scene_collective(self.comm, self.path, self.overrides)
         with agree(self.comm):
             if writes and self.comm.rank == 0:
-                claim(self.out, self.command, scene.name, path=self.path, empty=self.empty)
+                named = [scene.path(file) for file in (scene.tissue.mesh, scene.motion.csv) if file is not None]
+                claim(self.out, self.command, scene.name, inputs=[find_scene(self.path), *named], empty=self.empty)
+        if writes:
+            follow(self.out)
         described = f": {escape(scene.description)}" if scene.description else ""
         self.console.print(f"[bold]{escape(scene.name)}[/bold]{described}", soft_wrap=True)
         return scene
@@ -88,9 +92,9 @@ class Session:
         if scene.tissue.refine is None:
             model = build(scene, comm=self.comm)
         else:
-            from softgrasp.fem.accuracy.adapt import build_to_tolerance  # only scenes with graded cells pay for it
+            from softgrasp.fem.accuracy import adapt  # only scenes with graded cells pay for it
 
-            model = build_to_tolerance(scene, self.comm, steps)
+            model = adapt.build(scene, comm=self.comm, steps=steps)
         layout = model.system.layout
         self.console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)")
         show_warnings(self.console, model.space.mesh.notes)
@@ -115,7 +119,7 @@ class Session:
         with agree(self.comm):
             if self.comm.rank == 0:
                 self.out.mkdir(parents=True, exist_ok=True)
-                before = read_result(self.out).get("files", [])
+                before = files_of(read_result(self.out))
                 files = [table.write_csv(self.out / name) for name, table in tables.items()]
                 files += [write_scene(self.out, scene), self.out / "result.json"]
                 names = {*before, *(f.relative_to(self.out).as_posix() for f in files)}
@@ -136,7 +140,7 @@ class Session:
         with agree(self.comm):
             if self.comm.rank == 0:
                 self.out.mkdir(parents=True, exist_ok=True)
-                before = read_result(self.out).get("files", [])
+                before = files_of(read_result(self.out))
                 files += [write_json(self.out / "result.json", result), write_scene(self.out, scene)]
                 drawing = time.perf_counter(), sum(os.times()[:4])
                 content = page()

@@ -12,6 +12,11 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.run.simulate import Run, RunOptions
+from softgrasp.fem.run.stepping import make_ts
+
 
 def timed(comm: MPI.Intracomm, call: Callable[[], Any]) -> float:
     """Seconds of a call on the slowest rank, after a collection of garbage. Collective."""
@@ -77,3 +82,50 @@ def power_law(x: Sequence[float | None], y: Sequence[float | None]) -> float | N
     if len(set(a[good])) < 2:
         return None
     return float(np.polyfit(np.log(a[good]), np.log(b[good]), 1)[0])
+
+
+class RepeatableRun:
+    """A run that can be taken back to its start, to time its steps any number of times. Collective."""
+
+    def __init__(self, model: Model) -> None:
+        self.comm: MPI.Intracomm = model.system.layout.comm
+        self.run = Run(model, RunOptions())
+        self.ts = make_ts(self.run)
+        self.run.start()
+        self.begin = self.run.state.array.copy()
+
+    def rewind(self) -> None:
+        """Back to step 0. Collective."""
+        run = self.run
+        run.state.array[:] = self.begin
+        run.state.z.stateIncrease()
+        run.state.v.stateIncrease()
+        run.midpoint.start(run.state)
+        run.midpoint.dissipated = 0.0
+        run.reached = 0
+        self.ts.setStepNumber(0)
+
+    def seconds_per_step(self, count: int) -> float:
+        """Seconds of a step on the slowest rank, over at least ``count`` steps. Collective."""
+        run, before, done = self.run, self.run.seconds, 0
+        while done < count:
+            self.rewind()
+            n = min(run.steps, count - done)
+            self.comm.Barrier()
+            run.advance_to(self.ts, n)
+            done += n
+        return float(self.comm.allreduce(run.seconds - before, MPI.MAX)) / done
+
+    def flops(self) -> float:
+        """Operations that PETSc counts in one step, over all ranks. Collective."""
+        self.rewind()
+        few, many = min(1, self.run.steps), min(11, self.run.steps)
+        self.run.advance_to(self.ts, few)
+        before = PETSc.Log.getFlops()
+        self.run.advance_to(self.ts, many)
+        return float(self.comm.allreduce(PETSc.Log.getFlops() - before)) / max(many - few, 1)
+
+    def destroy(self) -> None:
+        """Free the PETSc objects. Collective."""
+        self.ts.destroy()
+        self.run.midpoint.destroy()

@@ -22,7 +22,7 @@ from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.residual import ResidualSpace
 from softgrasp.reduction.certified.trainer import Trainer, build_certified
 from softgrasp.reduction.certified.training import certified_model, scene_drive
-from softgrasp.reduction.certified.truth import energy_norm, true_error
+from softgrasp.reduction.certified.validation import energy_norm, true_error
 from softgrasp.reduction.parameters import materials_at
 from softgrasp.reduction.replay import FullRun
 from tests.hardcases.cases import EPS, Family, HardCase, Outcome, here, make, textbook

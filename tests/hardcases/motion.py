@@ -16,7 +16,8 @@ import scipy.sparse.linalg
 from softgrasp.fem.errors import Interrupted
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, to_scipy
-from softgrasp.fem.run.midpoint import make_midpoint, midpoint_matrix, state_on
+from softgrasp.fem.run.make import make_midpoint
+from softgrasp.fem.run.midpoint import midpoint_matrix, state_on
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.run.trajectory import Trajectory

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.errors import SoftgraspError
-from softgrasp.study.shell.folder import claim
+from softgrasp.study.shell.folder import claim, folder_lock
 from softgrasp.study.shell.session import list_files, progress_bar
 from tests.hardcases import certified, faults, motion, reduction, riccati, statics
 from tests.hardcases.cases import Family, FamilyResult, HardCaseResult
@@ -35,6 +35,7 @@ def run_family(family: Family, quick: bool) -> FamilyResult:
     return FamilyResult(family, cases, time.perf_counter() - begin)
 
 
+@folder_lock()
 def run_hardcases(
     out: Path,
     console: Console,
@@ -53,7 +54,6 @@ def run_hardcases(
         raise SoftgraspError("hardcases starts the ranks that it needs by itself; run it without mpiexec")
     families = choose(family)
     claim(out, "hardcases", "", empty=empty)
-    out.mkdir(parents=True, exist_ok=True)
     results = []
     with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:
         task = bar.add_task("hard cases", total=len(families))

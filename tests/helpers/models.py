@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from skfem.helpers import ddot, div, dot, sym_grad
 
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.mesh.tissue_mesh import cell_nodes, make_mesh
+from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import PETSc, to_scipy
 from softgrasp.fem.run.simulate import Run, RunOptions

@@ -8,8 +8,9 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc
-from softgrasp.fem.system import BlockSystem, Damping, LayerMaterial
+from softgrasp.fem.system import BlockSystem, Damping
 from softgrasp.lqr.dense.care import StateSpace
 from softgrasp.lqr.dense.modal import relative_space
 from softgrasp.lqr.plant.block import Block

@@ -10,10 +10,10 @@ import pytest
 import scipy.linalg
 from mpi4py import MPI
 
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.solve.modes import lowest_modes
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.model import ModelError, ReducedModel, SmallModel, UnstableModelError
 from softgrasp.reduction.online import run

@@ -15,6 +15,7 @@ from rich.console import Console
 
 import softgrasp as sg
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.owned import LIST
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.fem.scene.scene import scene_schema
 from softgrasp.study.forward.run import run_simulate
@@ -105,7 +106,7 @@ def test_a_run_removes_what_the_run_before_left(tmp_path: Path) -> None:
     (tmp_path / "result.json").write_text(json.dumps(named))
     again = run_simulate(SCENE, tmp_path, [*SMALL, "output.fields='none'"], QUIET, quiet=True, pictures=False)
     there = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
-    assert there == {*again["files"], "mine.txt"}
+    assert there == {*again["files"], LIST, "old.csv", "mine.txt"}  # no run has written old.csv
     assert (tmp_path / "../outside.txt").exists()
     assert again["time"]["pictures_cpu"] < again["time"]["total_cpu"]
 

@@ -11,9 +11,11 @@ import scipy.linalg
 import skfem
 from mpi4py import MPI
 
-from softgrasp.fem.accuracy.adapt import build_to_tolerance, estimated
+import softgrasp as sg
+from softgrasp.fem.accuracy import adapt
+from softgrasp.fem.accuracy.adapt import estimated
 from softgrasp.fem.accuracy.estimate import cell_products, difference, estimate, indicators, next_order, prolong
-from softgrasp.fem.accuracy.small import reduced
+from softgrasp.fem.accuracy.krylov import krylov_model
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import times_columns, total
@@ -58,7 +60,7 @@ def error(y: np.ndarray, fine: np.ndarray) -> float:
 )
 def test_small_model_follows_the_run(comm: MPI.Intracomm, change: Any) -> None:
     model = build(make_scene(change), comm=comm)
-    small, run = reduced(model).run, simulate(model)
+    small, run = krylov_model(model).run, simulate(model)
     # what modes beyond the moments answer to the jumps of the jerk
     assert error(small.deformation + small.rigid - run.outputs_rigid, deformation(run)) < 2e-3
     assert np.abs(small.rigid - run.outputs_rigid).max() < 1e-4
@@ -91,7 +93,7 @@ def test_shift_of_the_zone_is_part_of_the_error(comm: MPI.Intracomm) -> None:
 def test_tolerance_is_reached_and_estimated(comm: MPI.Intracomm, tolerance: float) -> None:
     steps = {"time": {"steps": 300}}
     fine = simulate(build(with_refine(make_scene(TIP, steps), 3, 2e-4), comm=comm))
-    model = build_to_tolerance(with_refine(make_scene(TIP, steps), 2, tolerance), comm)
+    model = adapt.build(with_refine(make_scene(TIP, steps), 2, tolerance), comm=comm)
     result, run = model.accuracy, simulate(model)
     assert result is not None
     assert result.obstacle == ""
@@ -101,6 +103,18 @@ def test_tolerance_is_reached_and_estimated(comm: MPI.Intracomm, tolerance: floa
     assert true <= result.bound
     assert error(result.corrected(run.outputs) - fine.outputs_rigid, deformation(fine)) <= 0.6 * true
     assert run.energy_drift < 1e-12
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_library_builds_to_the_tolerance(comm: MPI.Intracomm, order: int) -> None:
+    changes = [f"tissue.order={order}", "tissue.refine={tolerance=1e-2}", "time.steps=300"]
+    model = sg.build("paper_forward", changes, comm)
+    finest = ["tissue.order=3", "tissue.refine={tolerance=2e-4}", "time.steps=300"]
+    fine = sg.build("paper_forward", finest, comm, steps=False)
+    assert error(deformation(simulate(model)), deformation(simulate(fine))) <= 1e-2
+    assert model.accuracy is not None
+    mesh = model.space.mesh
+    assert sg.build(model.scene, comm=comm, mesh=mesh).accuracy is None  # a mesh that is given is taken as it is
 
 
 def test_cubic_elements_are_estimated_by_those_of_order_four(comm: MPI.Intracomm) -> None:
@@ -115,7 +129,7 @@ def test_mesh_file_reaches_its_tolerance(comm: MPI.Intracomm, mpi_tmp_path: Path
     steps = {"steps": 150}
     scenes = [l_scene(mpi_tmp_path, comm, order=o, refine={"tolerance": t}) for o, t in ((2, 2e-2), (3, 1e-3))]
     scenes = [s.model_copy(update={"time": s.time.model_copy(update=steps)}) for s in scenes]
-    model, fine = build_to_tolerance(scenes[0], comm), simulate(build(scenes[1], comm=comm))
+    model, fine = adapt.build(scenes[0], comm=comm), simulate(build(scenes[1], comm=comm))
     run = simulate(model)
     true = error(deformation(run), deformation(fine))
     assert model.accuracy is not None
@@ -128,29 +142,32 @@ def test_mesh_file_reaches_its_tolerance(comm: MPI.Intracomm, mpi_tmp_path: Path
 def test_passes_end_at_most_and_say_so(comm: MPI.Intracomm) -> None:
     data = make_scene(TIP, {"time": {"steps": 300}}).model_dump(by_alias=True, exclude_none=True)
     data["tissue"] |= {"order": 1, "refine": {"tolerance": 1e-2, "most": 1500}}
-    model = build_to_tolerance(Scene.model_validate(data), comm)
+    model = adapt.build(Scene.model_validate(data), comm=comm)
     assert model.system.layout.n_e <= 1500
     assert model.accuracy is not None
     assert model.accuracy.obstacle == "tissue.refine.most = 1500 unknowns allow no finer mesh"
     data["tissue"]["refine"] = {"tolerance": 1e-2, "passes": 1}
-    model = build_to_tolerance(Scene.model_validate(data), comm)
+    model = adapt.build(Scene.model_validate(data), comm=comm)
     assert model.accuracy is not None
     assert model.accuracy.obstacle == "tissue.refine.passes = 1 are used up"
     data["tissue"]["refine"] = {"tolerance": 1e-2, "passes": 0}
-    model = build_to_tolerance(Scene.model_validate(data), comm)
+    model = adapt.build(Scene.model_validate(data), comm=comm)
     assert model.accuracy is None  # the a-priori mesh
     result = estimated(model)
     assert (result.tolerance, result.obstacle) == (1e-2, "")  # about met, which is no failure
     data["tissue"] |= {"refine": {"tolerance": 1e-2, "passes": 0, "most": 500}}
     result = estimated(build(Scene.model_validate(data), comm=comm))
     assert result.obstacle == "tissue.refine.passes = 0 allow no better mesh"
+    data["tissue"]["refine"] = {"tolerance": 1e-2, "most": 500}
+    result = estimated(build(Scene.model_validate(data), comm=comm))
+    assert result.obstacle == "its mesh is not one that was refined for this model"  # passes have nothing to do with it
 
 
 def test_tolerance_below_the_steps_is_refused(comm: MPI.Intracomm) -> None:
     with pytest.raises(SceneError, match=r"is below the error .* that time.steps = 60 leave on any mesh: use at least"):
-        build_to_tolerance(with_refine(make_scene(TIP), 2, 1e-3), comm)
+        adapt.build(with_refine(make_scene(TIP), 2, 1e-3), comm=comm)
     # feedback has steps of its own
-    model = build_to_tolerance(with_refine(make_scene(TIP), 2, 1e-2), comm, steps=False)
+    model = adapt.build(with_refine(make_scene(TIP), 2, 1e-2), comm=comm, steps=False)
     assert model.accuracy is not None
     assert model.accuracy.time_error > 1e-2
 
@@ -166,7 +183,7 @@ def test_time_error_is_that_of_the_steps(comm: MPI.Intracomm) -> None:
 def test_cells_share_the_difference_of_the_energies(comm: MPI.Intracomm) -> None:
     """sum_T k_T(e_i, e_j) = x'_i K' x'_j - x_i K x_j for static solutions on nested spaces."""
     model = build(make_scene(LAYERED, TIP), comm=comm)
-    up, small = reduced(next_order(model)), reduced(model)
+    up, small = krylov_model(next_order(model)), krylov_model(model)
     e = up.X - prolong(model, up.model, small.X)
     E = total(comm, cell_products(up.model, e).sum(axis=0))
     energies = [total(comm, s.X.T @ times_columns(s.model.system.K_ee, s.X)) for s in (up, small)]
@@ -190,7 +207,7 @@ def test_orders_of_adaptive_and_even_meshes(
 ) -> None:
     """Even meshes converge with 2 alpha = 1 whatever the order, adaptive ones with twice that of the elements."""
     steps = {"time": {"steps": 300}}
-    graded = [build_to_tolerance(with_refine(make_scene(TIP, steps), order, t), comm, steps=False) for t in tolerances]
+    graded = [adapt.build(with_refine(make_scene(TIP, steps), order, t), comm=comm, steps=False) for t in tolerances]
     sizes = [{"tissue": {"cells": [n, 2 * n], "order": order}} for n in cells]
     even = [build(make_scene(TIP, steps, size), comm=comm) for size in sizes]
     fine = deformation(simulate(build(with_refine(make_scene(TIP, steps), 3, 3e-6), comm=comm)))  # 2e-6 off
@@ -207,7 +224,7 @@ def test_orders_of_adaptive_and_even_meshes(
 @pytest.mark.ranks
 def test_passes_refine_the_same_cells_on_any_ranks(comm: MPI.Intracomm) -> None:
     scene = with_refine(make_scene(TIP, {"time": {"steps": 300}}), 1, 5e-2)
-    model, alone = (build_to_tolerance(scene, c) for c in (comm, MPI.COMM_SELF))
+    model, alone = (adapt.build(scene, comm=c) for c in (comm, MPI.COMM_SELF))
     assert alone.accuracy is not None
     assert alone.accuracy.passes > 0
     assert fingerprint(model.space.mesh) == fingerprint(alone.space.mesh)
@@ -243,7 +260,7 @@ def test_lines_of_a_box_against_even_ones(comm: MPI.Intracomm) -> None:
     base = ["tissue.order=2", "tissue.material={young=1e5,poisson=0.3,rho=1070.0}"]
 
     def statics(*changes: str) -> np.ndarray:
-        small = reduced(build(load_scene("block_3d", [*base, *changes]), comm=comm))
+        small = krylov_model(build(load_scene("block_3d", [*base, *changes]), comm=comm))
         return (small.C @ small.G)[:3]  # the tip, against translations and rotations; V' K V = 1
 
     fine = statics("tissue.cells=[9,9,18]", "tissue.refine={}")
@@ -288,7 +305,7 @@ FINE = {"block_3d": ["tissue.cells=[10,6,14]"], "pillow_3d": ["tissue.refine={to
 def test_estimates_of_scenes(comm: MPI.Intracomm, name: str, changes: list[str], most: float) -> None:
     """As they ship and with even linear cells, against finer graded meshes; no error is larger than ``most``."""
     fine = [*(STRIP if STRIP[0] in changes else []), *FINE.get(name, FINEST)]
-    small, other = (reduced(build(load_scene(name, c), comm=comm)) for c in (changes, fine))
+    small, other = (krylov_model(build(load_scene(name, c), comm=comm)) for c in (changes, fine))
     true, _ = difference(small, other)
     result = estimate(small.model, small)
     assert true <= most
@@ -303,8 +320,8 @@ def test_estimates_of_scenes(comm: MPI.Intracomm, name: str, changes: list[str],
 def test_mesh_file_is_compared_with_what_is_finer_everywhere(comm: MPI.Intracomm, order: int) -> None:
     """The bisected edges of the pillow leave its error, which is inside."""
     changes = ["time.steps=100", "tissue.refine=false"]
-    fine = reduced(build(load_scene("pillow_3d", ["time.steps=100"]), comm=comm))
-    small = reduced(build(load_scene("pillow_3d", [*changes, f"tissue.order={order}"]), comm=comm))
+    fine = krylov_model(build(load_scene("pillow_3d", ["time.steps=100"]), comm=comm))
+    small = krylov_model(build(load_scene("pillow_3d", [*changes, f"tissue.order={order}"]), comm=comm))
     true, result = difference(small, fine)[0], estimate(small.model, small)
     assert 0.4 <= result.estimate / true <= 1.1
     assert true <= result.bound

@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.accuracy.adapt import estimated
-from softgrasp.fem.accuracy.small import reduced
+from softgrasp.fem.accuracy.krylov import krylov_model
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from tests.helpers.models import CUBE, make_scene
@@ -44,7 +44,7 @@ EFFECTS: dict[str, Any] = {
 @pytest.mark.parametrize("changes", TINY.values(), ids=TINY)
 def test_small_model_of_a_tiny_mesh_is_the_full_one(comm: MPI.Intracomm, changes: Any, effects: Any) -> None:
     model = build(make_scene(*changes, effects), comm=comm)
-    small, run = reduced(model), simulate(model)
+    small, run = krylov_model(model), simulate(model)
     assert small.V.shape[1] <= model.system.layout.n_e
     deformation = run.outputs - run.outputs_rigid
     scale = np.abs(deformation).max()

@@ -16,7 +16,8 @@ from mpi4py import MPI
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.mesh.check import check_cells, components, signed_volumes
 from softgrasp.fem.mesh.file import read_mesh
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh, cell_nodes, make_mesh, structured_mesh
+from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh, cell_nodes, structured_mesh
 from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from softgrasp.fem.scene.tissue import Contact
 

@@ -18,7 +18,8 @@ from mpi4py import MPI
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.grading import bisect, distribute
-from softgrasp.fem.mesh.tissue_mesh import MeshArrays, TissueMesh, Whole, make_mesh, spread, structured_mesh
+from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.mesh.tissue_mesh import MeshArrays, TissueMesh, Whole, spread, structured_mesh
 from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.contact import contact_facets

@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 from softgrasp.fem import resources
 from softgrasp.fem.errors import ResourceError
-from softgrasp.fem.mesh.tissue_mesh import make_mesh
+from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import box_simplices, check_memory, free_bytes, need
 from softgrasp.fem.strain.body import Body

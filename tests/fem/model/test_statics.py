@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from skfem.helpers import ddot, div, sym_grad
 
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, structured_mesh
 from softgrasp.fem.model.assembly import Inventory, _bilinear, assemble, discretise
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.system import LayerMaterial, tissue_matrices
+from softgrasp.fem.system import tissue_matrices
 from tests.helpers.models import dof_order, gather_matrix, gather_rows, local_rows, make_scene
 
 Array = NDArray[np.float64]

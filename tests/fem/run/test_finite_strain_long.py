@@ -11,8 +11,8 @@ import pytest
 
 from softgrasp.fem.effects.finite_strain import linear_error
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.fields.scales import gradient
 from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.model.scales import gradient
 from softgrasp.fem.petsc import times_columns
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.trajectory import Trajectory

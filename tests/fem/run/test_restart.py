@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from softgrasp.fem.checksums import read_manifest, write_arrays, write_manifest
 from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.resources import MARGIN, check_room
 from softgrasp.fem.run.checkpoint import FORMAT
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.fem.sealed import read_manifest, write_arrays, write_manifest
 from tests.helpers.models import make_scene
 
 pytestmark = pytest.mark.ranks

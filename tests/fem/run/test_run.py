@@ -212,19 +212,20 @@ def test_restart_file_of_another_format(comm: MPI.Intracomm, mpi_tmp_path: Path)
         simulate(small(comm), RunOptions(directory=mpi_tmp_path, resume=True))
 
 
-def test_ctrl_c_on_one_rank_leaves_a_restart_file(
-    comm: MPI.Intracomm, mpi_tmp_path: Path, capfd: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_on_one_rank_leaves_a_restart_file(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, capfd: pytest.CaptureFixture[str], number: signal.Signals
 ) -> None:
     def interrupt(run: Run) -> None:
         if comm.rank == comm.size - 1:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
 
     extra = ("time.steps=1000", 'output.snapshots="none"', "tissue.cells=[6,12]")
     whole = simulate(small(comm, *extra))
-    before = signal.getsignal(signal.SIGINT)  # a job in the background ignores it
+    before = signal.getsignal(number)  # a job in the background ignores it
     with pytest.raises(Interrupted, match="stopped after step"):
         simulate(small(comm, *extra), RunOptions(directory=mpi_tmp_path, progress=interrupt))
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before
     assert capfd.readouterr().err.count("stopping as soon as") == (comm.size == 1)  # rank 0 speaks when it was asked
     rest = simulate(small(comm, *extra), RunOptions(directory=mpi_tmp_path, resume=True))
     assert np.array_equal(whole.final, rest.final)

@@ -221,7 +221,7 @@ def test_state_and_vectors_held_whole_keep_the_same_bits(comm: MPI.Intracomm) ->
         midpoint.solve_midpoint(np.ones(2))
         midpoint.advance(state, state)
     own = slice(layout.start, layout.start + layout.n_local)
-    assert np.array_equal(midpoint.held.leave(midpoint.z.array_r)[own], state.z.array_r)
+    assert np.array_equal(midpoint.operators.leave(midpoint.z.array_r)[own], state.z.array_r)
     midpoint.destroy()
 
 

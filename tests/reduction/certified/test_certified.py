@@ -13,11 +13,11 @@ import pytest
 import scipy.linalg
 from mpi4py import MPI
 
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import to_scipy
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction import online
-from softgrasp.reduction.archive import seal
+from softgrasp.reduction.archive import write_checksums
 from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import states_of
 from softgrasp.reduction.certified import bounds
@@ -430,7 +430,7 @@ def test_a_file_of_other_keys_is_refused(
             about = json.loads(data["certificate/about"][()].tobytes()) | {part: changed}
             del data["certificate/about"]
             data["certificate/about"] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
-            seal(data)
+            write_checksums(data)
     comm.Barrier()
     with pytest.raises(ModelError, match=rf"cannot be read .*{word}"):
         load_certified(file, model.system.layout if whole else None)

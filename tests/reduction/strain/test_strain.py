@@ -13,11 +13,11 @@ import pytest
 import scipy.optimize
 
 from softgrasp.fem.errors import SolverError
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.strain.compiled import library
 from softgrasp.fem.strain.laws import LAWS, LawName
-from softgrasp.fem.system import LayerMaterial
-from softgrasp.reduction.archive import load, save, seal
+from softgrasp.reduction.archive import load, save, write_checksums
 from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.model import ModelError, Outputs
 from softgrasp.reduction.strain import stepper
@@ -297,6 +297,6 @@ def test_a_file_gives_the_same_model(tmp_path: Path) -> None:
         with h5py.File(tmp_path / "strain.h5", "r+") as file:
             data = json.loads(file.attrs["model"])
             file.attrs["model"] = json.dumps({k: v for k, v in {**data, key: value}.items() if v is not None})
-            seal(file)
+            write_checksums(file)
         with pytest.raises(ModelError, match=f"cannot be read .*{key}"):
             load(tmp_path / "strain.h5")

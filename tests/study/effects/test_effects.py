@@ -25,7 +25,6 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.study.effects import measure as effects_measure
 from softgrasp.study.effects.measure import (
     MeasuredScene,
-    RepeatableRun,
     bare_output,
     counting,
     difference,
@@ -38,7 +37,7 @@ from softgrasp.study.effects.measure import (
 from softgrasp.study.effects.page import parts
 from softgrasp.study.effects.result import Change, EffectResult, EffectsStudy
 from softgrasp.study.effects.run import check_variants, run_effects, study_effects
-from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, changed, neutral, switches
+from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, neutral, switches
 from softgrasp.study.effects.verdict import (
     Displacements,
     Experiments,
@@ -50,6 +49,7 @@ from softgrasp.study.effects.verdict import (
     verdict_of,
 )
 from softgrasp.study.report.tables import show_sections
+from softgrasp.study.shell.timing import RepeatableRun
 from tests.helpers.browser import find_chromium, look
 from tests.helpers.models import LAYERS, gather_states, make_scene, write_scene
 
@@ -466,7 +466,7 @@ def test_switched_off_leaves_a_valid_scene(comm: MPI.Intracomm) -> None:
         assert neutral(s.other, name, 2) is None or EFFECTS[name].active(neutral(s.other, name, 2))
     assert by["rotation"].other.control.R == [[1.0, 0.0], [0.0, 2.0]]
     assert by["damping"].other.tissue.layers["low"].beta is None
-    again = changed(by["rotation"].other, lambda table: None)
+    again = by["rotation"].other.changed(lambda table: None)
     assert again == by["rotation"].other
 
 

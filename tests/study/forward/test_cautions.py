@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softgrasp.fem.fields.scales import magnified
 from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.scales import magnified
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.study.forward.cautions import run_warnings
 from tests.hardcases.cases import make

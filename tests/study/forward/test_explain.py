@@ -12,9 +12,9 @@ from mpi4py import MPI
 from rich.console import Console
 
 from softgrasp.fem.effects.gate import SMALL_SHARE
-from softgrasp.fem.fields.scales import gradient, slowest
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import factor_bytes
+from softgrasp.fem.model.scales import gradient, slowest
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import simulate

@@ -13,7 +13,8 @@ import pytest
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.fem.errors import CheckpointError, Interrupted, SceneError, SolverError
+import softgrasp as sg
+from softgrasp.fem.errors import CheckpointError, SceneError, SolverError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.study.forward.run import run_simulate
@@ -27,11 +28,7 @@ def run(out: Path, *changes: str, **how: Any) -> str:
     said = io.StringIO()
     console = Console(file=said, width=400)
     call = (shipped_scenes()["paper_forward"], out, [*SMALL, *changes], console)
-    if "until" in how:
-        with pytest.raises(Interrupted):
-            run_simulate(*call, quiet=True, **how)
-    else:
-        run_simulate(*call, quiet=True, **how)
+    run_simulate(*call, quiet=True, **how)
     return said.getvalue()
 
 
@@ -127,6 +124,17 @@ def test_results_are_written_before_the_estimate(
     assert early["files"] == ["result.json", "scene.toml", "trajectory.csv"]
     assert "The error of the mesh could not be estimated: not definite" in whole["warnings"]
     assert "not definite" in (failed / "report.html").read_text()
+
+
+def test_the_library_and_the_command_refine_alike(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    changes = ["tissue.refine={tolerance=1e-2}", "time.steps=300", "effects.reaction=true"]  # order 1 needs a pass
+    run(mpi_tmp_path, *changes, pictures=False)
+    model = sg.build("paper_forward", [*SMALL, *changes])
+    assert model.accuracy is not None
+    if comm.rank == 0:
+        result = json.loads((mpi_tmp_path / "result.json").read_text())
+        assert result["mesh_error"]["passes"] == model.accuracy.passes > 0
+        assert result["mesh_error"]["n_e"] == model.system.layout.n_e
 
 
 def test_certify_at_finite_strain_is_refused_before_the_run(mpi_tmp_path: Path) -> None:

@@ -7,8 +7,10 @@ import json
 import locale
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -23,13 +25,17 @@ HANDLING = "from softgrasp.fem import _stack; import os; os.environ['PETSC_OPTIO
 pytestmark = pytest.mark.serial
 
 
-def softgrasp(*args: str, ranks: int = 1) -> subprocess.CompletedProcess[str]:
+def launched(ranks: int) -> list[str]:
+    """This Python, on one rank or more."""
     launcher = Path(sys.executable).with_name("mpiexec")
     if ranks > 1 and not launcher.exists():
         launcher = Path(shutil.which("mpiexec") or pytest.skip("no mpiexec"))
-    start = [str(launcher), "-n", str(ranks)] if ranks > 1 else []
+    return [*([str(launcher), "-n", str(ranks)] if ranks > 1 else []), sys.executable]
+
+
+def softgrasp(*args: str, ranks: int = 1) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [*start, sys.executable, "-m", "softgrasp.study.cli", *args],
+        [*launched(ranks), "-m", "softgrasp.study.cli", *args],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -97,7 +103,7 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, args: tuple[str, ...], word
 
 def test_a_resumed_run_says_from_where_and_what_it_timed(tmp_path: Path) -> None:
     small = ("simulate", str(FORWARD), "--out", str(tmp_path), "--set", "tissue.cells=[4,8]", "--set", "time.steps=40")
-    assert softgrasp(*small, "--until", "20", "--no-pictures").returncode != 0  # stopped, as asked
+    assert softgrasp(*small, "--until", "20", "--no-pictures").returncode == 0  # stopped, as asked
     run = softgrasp(*small, "--resume", "--no-pictures")
     assert run.returncode == 0, run.stderr
     assert "resumed from step 20 of 40" in run.stdout
@@ -169,3 +175,26 @@ def test_an_argument_that_is_no_text_is_one_sentence(tmp_path: Path) -> None:
     assert run.returncode == 1
     assert run.stderr.startswith("error: /no\\udcff.toml: this argument is not text here")
     assert run.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_job_that_is_told_to_end_goes_on_later(tmp_path: Path, ranks: int) -> None:
+    """SIGTERM to the program or to its launcher, as a cluster sends it before it kills."""
+    keys = ("tissue.cells=[12,24]", "time.steps=100000", "output.snapshots='none'", "output.fields='none'")
+    words = ["simulate", str(FORWARD), "--out", str(tmp_path), *(w for key in keys for w in ("--set", key))]
+    command = [*launched(ranks), "-m", "softgrasp.study.cli", *words, "--no-pictures"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None
+        while "n_e" not in program.stdout.readline():  # the model is built
+            assert program.poll() is None
+        time.sleep(2.0)  # factored
+        program.send_signal(signal.SIGTERM)
+        _, message = program.communicate(timeout=60)
+    assert program.returncode != 0
+    assert "lets --resume go on from there" in message, message
+    assert (tmp_path / "checkpoint" / "checkpoint.json").exists()
+    assert not (tmp_path / "softgrasp.lock").exists()
+    again = softgrasp(*words, "--resume", "--no-pictures", "--until", "99999", ranks=3 - ranks)
+    assert again.returncode == 1
+    assert f"was written on {ranks} rank" in again.stderr
+    assert "n_e" not in again.stdout  # refused before anything was built

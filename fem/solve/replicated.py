@@ -17,37 +17,37 @@ from softgrasp.fem.system import BlockSystem
 
 
 @dataclass(frozen=True)
-class Held:
+class ReplicatedOperators:
     """Stiffness, damping matrix and coupling as one rank steps them."""
 
     layout: BlockLayout
     whole: bool  # all rows are here, on a communicator of this rank alone
-    order: NodeOrder | None  # of the rows held; None: that of the layout
-    rows: slice | NDArray[np.intp]  # places of the owned rows among those held
+    order: NodeOrder | None  # of the rows here; None: that of the layout
+    rows: slice | NDArray[np.intp]  # places of the owned rows among those here
     K: PETSc.Mat  # stiffness, a copy, in blocks of d x d on one rank: a quarter less memory traffic than single entries
-    G: Array  # coupling to the hand, (rows held, n_s)
+    G: Array  # coupling to the hand, (rows here, n_s)
     S: PETSc.Mat  # matrix of the step; whoever factors it owns it
     D: PETSc.Mat | None
     M: PETSc.Mat | None  # mass, only beside D
     parts: tuple[PETSc.Mat, ...] = ()  # further matrices that were asked for, on the same rows; whoever asked owns them
 
     def agree(self) -> AbstractContextManager[None]:
-        """Guard of a block that is a rank's own affair when it holds everything, and collective otherwise. Collective.
+        """Guard of a block that is a rank's own affair when it has all rows, and collective otherwise. Collective.
 
         The block must not communicate by itself.
         """
         return agree(self.layout.comm) if self.whole else nullcontext()
 
     def gather(self, local: Array) -> Array:
-        """Rows held of a vector given by its owned rows. Collective."""
+        """Rows here of a vector given by its owned rows. Collective."""
         return self.enter(rows_on_all(self.layout.comm, local)) if self.whole else local
 
     def enter(self, x: NDArray[Any]) -> NDArray[Any]:
-        """Rows in the order of the layout as they are held."""
+        """Rows in the order of the layout as they lie here."""
         return x if self.order is None else self.order.enter(x)
 
     def leave(self, x: NDArray[Any]) -> NDArray[Any]:
-        """Rows held in the order of the layout."""
+        """Rows here in the order of the layout."""
         return x if self.order is None else self.order.leave(x)
 
     def destroy(self) -> None:
@@ -59,9 +59,9 @@ class Held:
                     A.destroy()
 
 
-def held_operators(
+def replicated_operators(
     system: BlockSystem, S: PETSc.Mat, whole: bool, ordered: bool, parts: tuple[PETSc.Mat, ...] = ()
-) -> Held:
+) -> ReplicatedOperators:
     """Operators of a system on the owned rows, or on all. Collective.
 
     Args:
@@ -76,7 +76,7 @@ def held_operators(
         if K.comm.size == 1:  # the conversion of a parallel matrix takes its source apart
             K.convert("baij")
         G, M = np.asfortranarray(system.G), None if D is None else system.M_ee
-        return Held(layout, False, None, slice(0, layout.n_local), K, G, S, D, M, parts)
+        return ReplicatedOperators(layout, False, None, slice(0, layout.n_local), K, G, S, D, M, parts)
     every = [whole_copy(A) for A in (system.K_ee, S, *beside, *parts)]
     for A in (S, *parts):
         A.destroy()
@@ -93,4 +93,4 @@ def held_operators(
         every[0].convert("baij")
     K, S, *rest = every
     D, M = rest[: len(beside)] or (None, None)
-    return Held(layout, True, order, rows, K, np.asfortranarray(G), S, D, M, tuple(rest[len(beside) :]))
+    return ReplicatedOperators(layout, True, order, rows, K, np.asfortranarray(G), S, D, M, tuple(rest[len(beside) :]))

@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.study.pictures.beside import beside
+from softgrasp.study.pictures.background import draw_in_background
 
 HERE = os.getpid()
 COMM = MPI.COMM_WORLD
@@ -25,7 +25,7 @@ def draw(out: Path) -> list[Path]:
 @pytest.mark.ranks(2)
 def test_files_come_back(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    waits = beside(COMM, out, draw)
+    waits = draw_in_background(COMM, out, draw)
     assert not out.exists()  # a command that fails before it asks leaves nothing
     assert waits() == ([] if COMM.rank else [out / "drawn.png"])
     forked = COMM.size == 1 and len(os.sched_getaffinity(0)) > 1
@@ -38,12 +38,12 @@ def test_errors_come_back_and_a_lost_process_is_replaced(tmp_path: Path) -> None
         raise SceneError("no such picture")
 
     with pytest.raises(SceneError, match="no such picture"):
-        beside(COMM, tmp_path, refuse)()
+        draw_in_background(COMM, tmp_path, refuse)()
 
     def killed(out: Path) -> list[Path]:
         if os.getpid() != HERE:
             os.kill(os.getpid(), signal.SIGKILL)
         return draw(out)
 
-    assert beside(COMM, tmp_path, killed)() == [tmp_path / "drawn.png"]
+    assert draw_in_background(COMM, tmp_path, killed)() == [tmp_path / "drawn.png"]
     assert (tmp_path / "drawn.png").read_text() == str(HERE)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import CheckpointError
+from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 
 AGAIN = "run again without --resume"
@@ -49,6 +50,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> str:
     Raises OSError: the file cannot be written in full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    note(path)
     with path.open("wb") as file:
         hashed = _Hashed(file)
         np.savez(hashed, allow_pickle=False, **arrays)
@@ -83,8 +85,9 @@ def write_manifest(path: Path, entry: Mapping[str, Any]) -> None:
     Raises OSError: it cannot be written; the old one stays.
     """
     fresh = path.with_suffix(".new")
+    note(fresh, path)
     with fresh.open("w") as file:
-        file.write(json.dumps({**entry, "sha256": _seal(entry)}, indent=2) + "\n")
+        file.write(json.dumps({**entry, "sha256": _checksum(entry)}, indent=2) + "\n")
         file.flush()
         os.fsync(file.fileno())
     fresh.replace(path)
@@ -105,7 +108,7 @@ def read_manifest(path: Path, format: int, advice: str = AGAIN) -> dict[str, Any
             f"{path} was written by another version of softgrasp (format {entry['format']}, this one reads {format}); "
             f"{advice}"
         )
-    if entry.pop("sha256", None) != _seal(entry):
+    if entry.pop("sha256", None) != _checksum(entry):
         raise CheckpointError(f"{path} is damaged: its SHA-256 is not that of its contents; {advice}")
     return entry
 
@@ -119,5 +122,5 @@ def remove_others(folder: Path, patterns: Iterable[str], kept: Iterable[str]) ->
                 old.unlink(missing_ok=True)
 
 
-def _seal(entry: Mapping[str, Any]) -> str:
+def _checksum(entry: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(entry, sort_keys=True).encode()).hexdigest()

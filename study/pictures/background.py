@@ -16,10 +16,12 @@ from typing import Any
 
 from mpi4py import MPI
 
+from softgrasp.fem.owned import note
+
 Draw = Callable[[Path], list[Path]]
 
 
-def beside(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[], list[Path]]:
+def draw_in_background(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[], list[Path]]:
     """Begin to draw into ``out``; the function returned waits for the files and names them on rank 0. Not collective.
 
     What is drawn must be on this rank already: the process has all of it by fork, nothing is copied or packed, and only
@@ -57,6 +59,7 @@ def beside(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[], list[Path
             raise done
         out.mkdir(parents=True, exist_ok=True)
         with folder:
+            note(*(out / file.name for file in done))
             return [Path(shutil.move(file, out / file.name)) for file in done]
 
     return files

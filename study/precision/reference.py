@@ -21,7 +21,7 @@ import numpy as np
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.full import FullRuns, Series, TimedRun, largest, relative
-from softgrasp.study.precision.result import Truth
+from softgrasp.study.precision.result import ReferenceSolution
 from softgrasp.study.precision.settings import Setting, contraction, edges, few_steps, fits
 
 ORDER = 3  # of the elements
@@ -37,7 +37,7 @@ ROUGH = 0.05  # error of a reference that is worth a warning
 STILL = 1e-12  # of the displacement: an output that moves less against the hand moves with it
 
 
-def make_truth(runs: FullRuns, tolerance: float | None = None) -> Truth:
+def make_reference(runs: FullRuns, tolerance: float | None = None) -> ReferenceSolution:
     """Run graded meshes until the finest is good enough or too large for the next, then more steps. Collective.
 
     Raises:
@@ -65,7 +65,9 @@ def make_truth(runs: FullRuns, tolerance: float | None = None) -> Truth:
     return combine(scene, meshes, middle, *late)
 
 
-def combine(scene: Scene, meshes: dict[Setting, TimedRun], middle: Setting, half: TimedRun, fine: TimedRun) -> Truth:
+def combine(
+    scene: Scene, meshes: dict[Setting, TimedRun], middle: Setting, half: TimedRun, fine: TimedRun
+) -> ReferenceSolution:
     """y* and its error estimate: runs with few steps on meshes, coarse to fine, and two with more on the middle one.
 
     Raises:
@@ -87,7 +89,7 @@ def combine(scene: Scene, meshes: dict[Setting, TimedRun], middle: Setting, half
     sizes = [r.n_e for r in meshes.values()]
     q = contraction([change[0] for change in changes], sizes[-1] / sizes[-2] if len(sizes) > 1 else 1.0)
     steps, mesh = (relative(v - coarse, scale, d) for v in (fine.series.at(few), last))
-    truth = Truth(
+    truth = ReferenceSolution(
         Series(t, total, d),
         space=tuple(c * q / (1 - q) for c in changes[-1]),  # type: ignore[arg-type]
         time=relative(time_part, scale, d),
@@ -98,7 +100,9 @@ def combine(scene: Scene, meshes: dict[Setting, TimedRun], middle: Setting, half
     return replace(truth, note=_note(scene, list(meshes.items()), middle, fine.steps, truth))
 
 
-def _note(scene: Scene, meshes: list[tuple[Setting, TimedRun]], middle: Setting, steps: int, truth: Truth) -> str:
+def _note(
+    scene: Scene, meshes: list[tuple[Setting, TimedRun]], middle: Setting, steps: int, truth: ReferenceSolution
+) -> str:
     """What the reference is built from, how good it is, and what is wrong with it."""
     setting, run = meshes[-1]
     words = (

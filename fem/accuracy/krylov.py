@@ -21,17 +21,16 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs, output_columns
 from softgrasp.fem.petsc import Array, normalising, times_columns, total
 from softgrasp.fem.run.motion import force_values, free_table
-from softgrasp.fem.solve.solvers import choose_solver, make_solver
+from softgrasp.fem.solve.stiffness import factored_stiffness
 
 BLOCKS = 4
 DROPPED = 1e-12  # of the squared length before the projection: directions that are rounding only, or known already
-PREFIX = "softgrasp_accuracy_"
 
 Solve = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
-class Small:
+class KrylovModel:
     """M xi'' + D xi' + K xi = G c, z = V xi, of a model; small arrays on every rank."""
 
     V: Array  # basis, local rows (n_local, N), with V' K V = 1
@@ -46,9 +45,9 @@ class Small:
     model: Model  # whose it is
 
     @cached_property
-    def run(self) -> SmallRun:
-        """The run of the scene, see :func:`run_small`."""
-        return run_small(self)
+    def run(self) -> KrylovRun:
+        """The run of the scene, see :func:`run_krylov`."""
+        return run_krylov(self)
 
     @cached_property
     def modes(self) -> tuple[Array, Array]:
@@ -60,16 +59,11 @@ class Small:
 @contextmanager
 def static_solves(model: Model) -> Iterator[Solve]:
     """What applies K_ee^-1 to columns, factored once. Collective."""
-    system = model.system
-    name, _ = choose_solver(system.layout, "auto", few=True)
-    solver = make_solver(system.K_ee.copy(), name, system.layout, PREFIX, 1e-10, reproducible=False)
-    try:
+    with factored_stiffness(model.system, rtol=1e-10) as solver:
         yield solver.columns
-    finally:
-        solver.destroy()
 
 
-def reduced(model: Model) -> Small:
+def krylov_model(model: Model) -> KrylovModel:
     """The small model of a model, with `BLOCKS` static solves of each column. Collective.
 
     A mesh with fewer unknowns than columns ends in a basis of its whole space, where the small model is the full one.
@@ -101,11 +95,11 @@ def reduced(model: Model) -> Small:
     C_s = np.vstack([o.C_s for o in outputs])
     pair = total(comm, V.T @ np.hstack([system.G, C]))
     n_s = system.layout.n_s
-    return Small(V, (M + M.T) / 2, (D + D.T) / 2, pair[:, :n_s], pair[:, n_s:].T, C_s, X, model)
+    return KrylovModel(V, (M + M.T) / 2, (D + D.T) / 2, pair[:, :n_s], pair[:, n_s:].T, C_s, X, model)
 
 
 @dataclass(frozen=True)
-class SmallRun:
+class KrylovRun:
     """A run of a small model."""
 
     deformation: Array  # outputs against the hand, (steps + 1, p)
@@ -114,7 +108,7 @@ class SmallRun:
     accelerations: Array  # xi'' at the middle of each step, (steps, N)
 
 
-def run_small(small: Small, steps: int | None = None) -> SmallRun:
+def run_krylov(small: KrylovModel, steps: int | None = None) -> KrylovRun:
     """Run the scene's motion or force with the midpoint rule, as the full model does.
 
     Raises SceneError: a CSV file of the motion does not fit.
@@ -138,7 +132,7 @@ def run_small(small: Small, steps: int | None = None) -> SmallRun:
         table, _ = free_table(system, scene, dt)
         q, loads = table.q, g - table.a - alpha * (table.v[1:] + table.v[:-1]) / 2
         Z, accelerations = _midpoint(small.M, small.D, np.eye(len(z)), small.G, loads, z, dt)
-    return SmallRun(Z @ small.C.T, q @ small.C_s.T, loads, accelerations)
+    return KrylovRun(Z @ small.C.T, q @ small.C_s.T, loads, accelerations)
 
 
 def _midpoint(M: Array, D: Array, K: Array, B: Array, f: Array, x: Array, dt: float) -> tuple[Array, Array]:

@@ -1,0 +1,73 @@
+"""What a reduced model was built from, key by key of its scene, and which key of another scene is not so.
+
+A reduced model is affine in the materials of its scene, and any motion and time may drive it; all else is in its
+matrices: gravity, drag, contact, mesh, order, law, outputs, hand.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+from softgrasp.fem.errors import shortened
+from softgrasp.reduction.model import ModelError
+
+Origin = Mapping[str, Any]
+"""Value of every key that decides on a run, a file by the hash of what it holds; nothing that is off or at rest."""
+
+# of no effect on a run beyond the tolerance of its solver
+FREE = re.compile(
+    r"(name|description|reduction|study|output)\b|control\.(?!outputs)|time\.(solver|rtol|reproducible)"
+    r"|effects\.finite_strain\.tol|tissue\.(read_limit|repair|seam)"
+)
+MATERIAL = re.compile(r"tissue\.(layers\.[^.]+\.)?material\b|tissue\.layers\.[^.]+\.beta|effects\.damping\.(kind|beta)")
+MOTION = re.compile(r"(motion|time)\b")
+UNKNOWN = (
+    "does not hold what it was built from (it is of an earlier version), so its gravity, contact, mesh and outputs are "
+    "not compared with those of the scene; reduce the scene again"
+)
+"""What is said of a model without origin."""
+
+
+def origin_of(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the keys of a scene (:attr:`softgrasp.fem.model.build.Model.scene_keys`) that decide on a run."""
+    keys = {key: value for key, value in keys.items() if not FREE.match(key)}
+    if not any(keys.get("effects.gravity.g", ())):
+        keys = {key: value for key, value in keys.items() if not key.startswith("effects.gravity.")}
+    if not keys.get("effects.damping.alpha"):
+        keys.pop("effects.damping.drag", None)
+    keys.setdefault("time.end", keys["motion.duration"])
+    # false, 0 and [] say that an effect is off, or that there is none
+    return {key: value for key, value in keys.items() if value not in (False, 0, [])}
+
+
+def differing(own: Origin, other: Origin, free: tuple[re.Pattern[str], ...]) -> str:
+    """The first key, but for ``free`` ones, that differs between two origins, with both values; empty if none does."""
+    for key in [*own, *(key for key in other if key not in own)]:
+        if own.get(key) != other.get(key) and not any(pattern.match(key) for pattern in free):
+            mine = f"with {key} = {_text(key, own[key])}" if key in own else f"without {key}"
+            return f"{mine}, and the scene has {_text(key, other[key]) if key in other else 'none'}"
+    return ""
+
+
+def _text(key: str, value: Any) -> str:
+    if key in ("tissue.mesh", "motion.csv"):
+        return f"the file of hash {value[:12]}"
+    return shortened(json.dumps(value))
+
+
+def check_origin(origin: Origin, keys: Mapping[str, Any], name: str) -> None:
+    """Refuse a scene, by its keys, that differs from that of a model in more than materials, motion and time.
+
+    Raises ModelError: with the first key that differs.
+    """
+    if not origin:
+        warnings.warn(f"{name}: the model {UNKNOWN}", RuntimeWarning, stacklevel=3)
+    elif difference := differing(origin, origin_of(keys), (MATERIAL, MOTION)):
+        raise ModelError(
+            f"the model was built {difference}; it takes other materials, motions and times only, so reduce that "
+            "scene itself", name,
+        )  # fmt: skip

@@ -1,0 +1,136 @@
+"""A reduced model refuses scenes that differ in more than materials, motion and time, and names what differs."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import softgrasp as sg
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.reduction.archive import write_checksums
+from softgrasp.reduction.certified.archive import save_certified
+from softgrasp.reduction.certified.training import certified_model
+from softgrasp.reduction.model import ModelError, ReducedModel
+from softgrasp.reduction.strain.model import StrainModel
+
+BASE = (
+    "tissue.cells=[4, 8]", "time.steps=40", "effects.gravity={g=[0, -9.81]}",
+    "effects.damping={kind='rayleigh', beta=0.002, alpha=0.3}",
+)  # fmt: skip
+STRAIN = "effects.finite_strain={law='neo-hooke'}"
+OTHERS = {
+    "gravity": "effects.gravity.g=[0, -5.0]",
+    "no gravity": "effects.gravity=false",
+    "drag in space": "effects.damping.drag='space'",
+    "drag": "effects.damping.alpha=1.0",
+    "contact": "contact.box=[[0.0, 1.0], [1.0, 2.0]]",
+    "order": "tissue.order=2",
+    "cells": "tissue.cells=[5, 10]",
+    "size": "tissue.size=[1.0, 2.5]",
+    "outputs": "control={outputs=[{kind='node', point=[1.0, 0.0]}]}",
+    "reaction": "effects.reaction=true",
+    "hand": "hand.mass=5.0",
+    "law": "effects.finite_strain={law='stvk'}",
+}
+KEYS = {
+    "gravity": r"effects\.gravity\.g",
+    "no gravity": "and the scene has none",
+    "drag in space": r"effects\.damping\.drag",
+    "drag": r"effects\.damping\.alpha",
+    "contact": r"contact\.box",
+    "order": r"tissue\.order",
+    "cells": r"tissue\.cells",
+    "size": r"tissue\.size",
+    "outputs": r"control\.outputs",
+    "reaction": r"effects\.reaction",
+    "hand": r"hand\.mass",
+    "law": r"effects\.finite_strain\.law",
+}
+
+
+@cache
+def built(*overrides: str) -> tuple[Model, Trajectory]:
+    model = sg.build("paper_forward", [*BASE, *overrides])
+    return model, sg.simulate(model)
+
+
+@cache
+def reduced(kind: str, folder: Path) -> ReducedModel | StrainModel:
+    """A model of each kind, through its file: what it was built from is read back."""
+    path = folder / f"{kind}.h5"
+    if kind == "certified":
+        model = built()[0]
+        save_certified(certified_model(model, lowest_modes(model.system, 12)[1], k=4), path)
+    else:
+        sg.save(sg.reduce(*built(*[STRAIN] * (kind == "strain")), N=24), path)
+    return sg.load(path)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("origin")
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("kind", ["linear", "strain", "certified"])
+@pytest.mark.parametrize("what", list(OTHERS))
+def test_another_scene_is_refused_by_the_key_that_differs(folder: Path, kind: str, what: str) -> None:
+    if kind == "strain" and what in ("reaction", "drag in space"):
+        pytest.skip("not at finite strain")
+    own = [STRAIN] * (kind == "strain" and what != "law")
+    other = sg.build("paper_forward", [*BASE, *own, OTHERS[what]])
+    _, run = built(*[STRAIN] * (kind == "strain"))
+    with pytest.raises(ModelError, match=f"{KEYS[what]}.*reduce that scene itself"):
+        sg.replay(reduced(kind, folder), other, run)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("kind", ["linear", "strain", "certified"])
+def test_materials_motions_and_times_are_taken(folder: Path, kind: str) -> None:
+    strain = [STRAIN] * (kind == "strain")
+    rom, (model, run) = reduced(kind, folder), built(*strain)
+    again = sg.replay(rom, model, run)
+    others = [
+        "tissue.material={lambda=60.0, mu=55.0, rho=1.0}", "time.steps=50", "motion.target=[4.0, 3.0]",
+        "effects.damping.beta=0.004", "output.every=2", "name='other'",
+    ]  # fmt: skip
+    stiff, theirs = built(*strain, *others)
+    moved = sg.replay(rom, stiff, theirs, allow=True)
+    assert again.outputs.shape[0] == 41
+    assert moved.outputs.shape[0] == 51
+    # models of this size answer to a few per cent; the wrong material or motion would be off by more than 20 %
+    deformation = theirs.outputs - theirs.outputs_rigid
+    assert np.abs(moved.outputs - theirs.outputs).max() < 0.2 * np.abs(deformation).max()
+
+
+@pytest.mark.serial
+def test_an_effect_that_is_zero_is_off(folder: Path) -> None:
+    model = sg.build("paper_forward", [*BASE[:2], "effects.gravity={g=[0.0, 0.0]}"])
+    run = sg.simulate(model)
+    rom = sg.reduce(model, run, N=12)
+    plain = sg.build("paper_forward", BASE[:2])
+    assert np.array_equal(sg.replay(rom, plain, run).outputs, sg.replay(rom, model, run).outputs)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("kind", ["linear", "strain"])
+def test_a_file_of_an_earlier_version_is_read_and_says_what_it_lacks(folder: Path, kind: str) -> None:
+    reduced(kind, folder)
+    path = folder / f"old-{kind}.h5"
+    path.write_bytes((folder / f"{kind}.h5").read_bytes())
+    with h5py.File(path, "r+") as file:
+        about = json.loads(file.attrs["model"])
+        assert about.pop("origin")["contact.sides"] == ["left", "right"]
+        file.attrs["model"] = json.dumps(about)
+        write_checksums(file)
+    model, run = built(*[STRAIN] * (kind == "strain"))
+    with pytest.warns(RuntimeWarning, match="does not hold what it was built from"):
+        found = sg.replay(sg.load(path), model, run)
+    assert np.array_equal(found.outputs, sg.replay(reduced(kind, folder), model, run).outputs)
