@@ -305,7 +305,7 @@ def study(
     question: Annotated[
         list[str] | None,
         typer.Option(
-            help="only this question: forward, reduced, bases, riccati, reduced_riccati or loop; several with commas"
+            help="only this question: forward, reduced, bases, riccati or reduced_riccati; several with commas"
         ),
     ] = None,
     **shared: Any,

@@ -24,14 +24,14 @@ Reproducible = Literal["auto"] | bool
 
 # Largest problem of each solver on two ranks with 24 GiB. PETSc Cholesky in blocks is fastest per solve, but its
 # factorisation is the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back
-# (benchmarks.switches), but not the few solves of an equilibrium or of modes, nor without blocks. Above the last
+# (docs/benchmarks.md), but not the few solves of an equilibrium or of modes, nor without blocks. Above the last
 # limits the factor itself no longer fits.
 CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 20_000}  # 1: systems without a mesh
 FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
 # Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. The price of the same bits in
 # every run: between 1e4 and 5e4 unknowns in 3D steps and factorisation of a spread factor become the faster ones
-# (benchmarks.switches), and each rank needs the memory of the whole factor.
+# (docs/benchmarks.md), and each rank needs the memory of the whole factor.
 REPEATED_LIMIT = {1: 1_000_000, 2: 1_000_000, 3: 150_000}
 REPEATED_RANKS = 4
 # Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,

@@ -89,23 +89,6 @@ class ModalLoop:
         k = self.gain(K)
         return on_root(self.comm, lambda: np.asarray(scipy.linalg.eigvals(self.A + self.B @ k)))
 
-    def exact(self, K: Block, x: Block, C: Array, dt: float, steps: int) -> Array:
-        """C exp((A + B K) t) xi(0) at t = 0, dt, ..., the loop without a time step, (steps + 1, rows of C). Collective.
-
-        ``K``: gain, transposed, hand-relative; ``x``: x(0) minus target, one column; ``C``: (rows, 2 n_s + 2 k).
-        """
-        k, xi = self.gain(K), self.state(x)[:, 0]
-
-        def march() -> Array:
-            step, state, values = scipy.linalg.expm(dt * (self.A + self.B @ k)), xi, [C @ xi]
-            with np.errstate(over="ignore", invalid="ignore"):  # of a gain that does not stabilise
-                for _ in range(steps):
-                    state = step @ state
-                    values.append(C @ state)
-            return np.stack(values)
-
-        return on_root(self.comm, march)
-
     def quality(self, K: Block, best: Block, x: Block, optimal: float) -> LoopQuality:
         """Abscissa and cost of a gain against the optimal one. Collective.
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import qmc
 
-from softgrasp.fem.errors import SolverError
+from softgrasp.fem.errors import SceneError, SolverError, shortened
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.bases.basis import ReductionError
@@ -35,11 +35,16 @@ HeldOut = tuple[str, FullRun]
 
 
 def measure_strain(own: FullRun, times: FullTimes, say: Say) -> StrainStudy:
-    """Train, test and time. Collective. Raises SolverError: a run failed. ReductionError: there is no model."""
+    """Train, test and time. Collective. Raises SoftgraspError: a run failed, no N fits, or there is no model."""
     model = own.model
     options, hand = model.scene.reduction, 2 * model.system.layout.n_s
     chosen = options.N if "N" in options.model_fields_set else SIZES
     sizes = sorted({N for N in chosen if hand < N and N % 2 == 0})  # those that a model can have
+    if not sizes:
+        raise SceneError(
+            f"reduction.N = {shortened(str(list(chosen)))}: a model at finite strain has an even number of columns, "
+            f"more than the {hand} of the hand; give for example [{hand + 4}, {hand + 10}]"
+        )
     box_runs, held, none = _box_runs(own, say)
     first, near = model.system.materials[0], []
     for share in SHARES if _has_target(model) else ():
