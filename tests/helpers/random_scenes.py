@@ -161,8 +161,8 @@ def _motion_and_time(
         rows = np.outer(np.sin(times / duration), span)
         np.savetxt(folder / "table.csv", np.column_stack([times, rows]), delimiter=",")
         motion["csv"] = "table.csv"
-    time: dict[str, Any] = {"steps": 1 if rng.random() < 0.05 else pick(rng, 2, 5, 10, 25), "solver": pick(rng, "auto", "auto", "cholesky", "mumps",
-                            "cg")}  # fmt: skip
+    steps, solver = pick(rng, 2, 5, 10, 25), pick(rng, "auto", "auto", "cholesky", "mumps", "cg")
+    time: dict[str, Any] = {"steps": 1 if rng.random() < 0.05 else steps, "solver": solver}
     if rng.random() < 0.15:
         time["end"] = duration * (1.5 if rng.random() < 0.2 else pick(rng, 0.5, 1.0))
     if "gravity" in effects and rng.random() < 0.5:
