@@ -16,7 +16,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
-from softgrasp.fem.errors import agree
+from softgrasp.fem.errors import agree, no_pipe
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.owned import note
@@ -196,7 +196,7 @@ def reading(
     comm = MPI.COMM_SELF if layout is None else layout.comm
     with agree(comm):
         try:
-            with h5py.File(path, "r") as file:
+            with h5py.File(no_pipe(path), "r") as file:
                 if file.attrs.get("format") not in (LINEAR, STRAIN):
                     raise ModelError(f"{path} is no reduced model of this version ({LINEAR!r}); reduce the scene again")
                 # one rank reads a reconstruction twice, not all of them

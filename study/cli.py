@@ -20,6 +20,7 @@ from softgrasp.study.shell.folder import default_folder
 from softgrasp.study.shell.options import parse_tolerance, takes
 
 LIST_WIDTH = 200  # [letters]
+FOREIGN = 5  # files that a list of runs leaves out by name
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
@@ -103,7 +104,12 @@ def list_runs(folder: Annotated[Path, typer.Argument(help="folder that the runs 
     if rank() == 0:
         wide = console()
         wide.width = max(wide.width, LIST_WIDTH)  # a narrower terminal breaks the lines, but loses nothing
-        wide.print(runs_below(folder).terminal())
+        runs, foreign = runs_below(folder)
+        wide.print(runs.terminal())
+        for file in foreign[:FOREIGN]:
+            wide.print(f"left out: {file} is damaged or not of softgrasp", soft_wrap=True, markup=False)
+        if len(foreign) > FOREIGN:
+            wide.print(f"and {len(foreign) - FOREIGN} more")
 
 
 @app.command()
