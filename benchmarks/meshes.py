@@ -23,7 +23,8 @@ from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.bases.registry import METHODS, find_method
 from softgrasp.reduction.replay import full_run
-from softgrasp.study.reduce.measure import steps_seconds, sweep
+from softgrasp.study.reduce.linear.measure import sweep
+from softgrasp.study.reduce.times import steps_seconds
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import machine
 from softgrasp.study.report.tables import Table
@@ -55,7 +56,7 @@ class MeshRow:
     time_setup: float
     time_online: float
     N: int  # its dimension
-    # error, error_deformation: see softgrasp.study.reduce.result.Point
+    # error, error_deformation: see softgrasp.study.reduce.linear.result.Point
     error: float
     error_deformation: float
     stable: bool  # of the reduced model

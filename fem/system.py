@@ -9,7 +9,7 @@ K_ee T + K_es = 0, and the only coupling is the inertia G = M_es + M_ee T:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -87,6 +87,8 @@ class BlockSystem:
     two_way: bool = False  # the tissue acts on the hand
     graded: bool = False  # nodes crowd where cells shrink, so that Euclidean norms of node values mean little
     points: Points | None = None  # where finite strain evaluates its law; None: K_ee z is the whole force
+    # factor and modes of K_ee, made by the first who asks (softgrasp.fem.solve.stiffness, softgrasp.fem.solve.modes)
+    kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def fall(self) -> Array:
@@ -114,7 +116,7 @@ class BlockSystem:
         G, M_rigid = coupling(self.layers, materials, self.T)
         matrix = layered_viscosity(self.layers, materials)
         damping = replace(self.damping, matrix=matrix, beta=materials[0].beta if matrix is None else 0.0)
-        return replace(self, materials=materials, M_ee=M_ee, K_ee=K_ee, G=G, M_rigid=M_rigid, damping=damping)
+        return replace(self, materials=materials, M_ee=M_ee, K_ee=K_ee, G=G, M_rigid=M_rigid, damping=damping, kept={})
 
 
 def sum_dense(terms: list[tuple[float, Array]]) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from softgrasp.lqr.reduced.riccati import full_gain, project_plant
 
 Method = Literal["auto", "dense", "newton_adi", "radi", "galerkin"]
 METHODS: tuple[Method, ...] = get_args(Method)
+Spelling = Method | Literal["newton-adi"]  # as in scenes
 # Exact to rounding, without a start or shifts that could fail, and still as fast as low rank within some tenths of a
 # second; the faster one of the two changes between 92 and 160 states (benchmarks.switches).
 DENSE_STATES = 200
@@ -43,7 +44,7 @@ class SolverChoice:
     reason: str
 
 
-def choose(problem: RiccatiProblem, method: Method = "auto") -> SolverChoice:
+def choose(problem: RiccatiProblem, method: Spelling = "auto") -> SolverChoice:
     """The method for a problem.
 
     Newton-ADI by default; RADI where damping couples the modes; Galerkin where complex factorisations no longer fit.
@@ -53,10 +54,11 @@ def choose(problem: RiccatiProblem, method: Method = "auto") -> SolverChoice:
 
     Raises SolverError: the name is unknown.
     """
-    if method not in METHODS:
+    name = cast(Method, method.replace("-", "_"))
+    if name not in METHODS:
         raise SolverError(f"the Riccati method {method!r} is unknown; choose one of {', '.join(METHODS)}")
-    if method != "auto":
-        return SolverChoice(method, "asked for")
+    if name != "auto":
+        return SolverChoice(name, "asked for")
     layout, damping = problem.layout, problem.system.damping
     if layout.states <= DENSE_STATES:
         return SolverChoice("dense", f"{layout.states} states <= {DENSE_STATES}: all modes, exact to rounding")
@@ -96,7 +98,7 @@ def make_solver(
 
 def solve(
     problem: RiccatiProblem,
-    method: Method = "auto",
+    method: Spelling = "auto",
     tol: float | None = None,
     progress: Progress | None = None,
     checkpoint: Path | None = None,
@@ -108,7 +110,7 @@ def solve(
 
     Args:
         problem: operators and weights.
-        method: dense, newton_adi, radi, galerkin, or auto by size and damping.
+        method: dense, newton_adi or newton-adi as in scenes, radi, galerkin, or auto by size and damping.
         tol: see :func:`make_solver`.
         progress: observer of the iteration.
         checkpoint: folder for restart files.

@@ -25,6 +25,11 @@ FREE = re.compile(
 )
 MATERIAL = re.compile(r"tissue\.(layers\.[^.]+\.)?material\b|tissue\.layers\.[^.]+\.beta|effects\.damping\.(kind|beta)")
 MOTION = re.compile(r"(motion|time)\b")
+UNKNOWN = (
+    "does not hold what it was built from (it is of an earlier version), so its gravity, contact, mesh and outputs are "
+    "not compared with those of the scene; reduce the scene again"
+)
+"""What is said of a model without origin."""
 
 
 def origin_of(keys: Mapping[str, Any]) -> dict[str, Any]:
@@ -60,12 +65,7 @@ def check_origin(origin: Origin, keys: Mapping[str, Any], name: str) -> None:
     Raises ModelError: with the first key that differs.
     """
     if not origin:
-        warnings.warn(
-            f"{name}: the model does not hold what it was built from (it is of an earlier version), so its gravity, "
-            "contact, mesh and outputs are not compared with those of the scene; reduce the scene again",
-            RuntimeWarning,
-            stacklevel=3,
-        )
+        warnings.warn(f"{name}: the model {UNKNOWN}", RuntimeWarning, stacklevel=3)
     elif difference := differing(origin, origin_of(keys), (MATERIAL, MOTION)):
         raise ModelError(
             f"the model was built {difference}; it takes other materials, motions and times only, so reduce that "

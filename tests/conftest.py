@@ -60,6 +60,11 @@ def pytest_runtest_makereport(
     return report
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--queries", type=int, default=500, help="random queries of the slow test of certified models")
+    parser.addoption("--seed", type=int, default=1, help="of the random queries")
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_configure(config: pytest.Config) -> None:
     reporter = config.pluginmanager.getplugin("terminalreporter")

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import zipfile
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -105,6 +106,32 @@ def module_of(name: str) -> Path | None:
         if (path / "__init__.py").is_file():
             return path / "__init__.py"
     return None
+
+
+def imports_of(path: Path, modules: set[str]) -> set[str]:
+    """Modules that a file imports anywhere: at its head, inside functions, and for types only."""
+    found = set()
+    for node in nodes_of(path):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            inside = {f"{node.module}.{alias.name}" for alias in node.names} & modules
+            found |= inside or {node.module}
+    return found & modules
+
+
+@pytest.mark.serial
+def test_no_circles() -> None:
+    """Also none of imports that run late or never; the face, whose names load when they are used, apart."""
+    names = {path: ("softgrasp", *path.relative_to(INSIDE).with_suffix("").parts) for path in SOURCES}
+    names |= {path: path.relative_to(ROOT).with_suffix("").parts for path in BESIDE}
+    modules = {".".join(name).removesuffix(".__init__"): path for path, name in names.items()}
+    graph = {name: imports_of(path, set(modules)) - {name} for name, path in modules.items()}
+    assert sum(map(len, graph.values())) > 1000  # else nothing is looked at
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+    graph["softgrasp.fem.errors"].add("softgrasp.study.cli")
+    with pytest.raises(CycleError):
+        TopologicalSorter(graph).prepare()
 
 
 @pytest.mark.serial

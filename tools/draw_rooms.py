@@ -65,14 +65,14 @@ def place(
         for j, room in enumerate(line):
             x = wide / 2 + (j - (len(line) - 1) / 2) * (WIDTH + BESIDE)
             at[package, room] = x, y
-            files = list((ROOT / package / room).glob("*.py")) if (ROOT / package / room).is_dir() else []
+            files = list((ROOT / package / room).rglob("*.py")) if (ROOT / package / room).is_dir() else []
             axes.add_patch(
                 FancyBboxPatch(
                     (x - WIDTH / 2, y - HEIGHT / 2), WIDTH, HEIGHT, "round,pad=0.02", fc="white", ec="#555", lw=0.8
                 )
             )
             text = f"{room}\n{len(files)} files" if files else room
-            axes.text(x, y, text, ha="center", va="center", size=8)
+            axes.text(x, y, text, ha="center", va="center", size=7.5)
     return at, top - height - 0.25
 
 

@@ -21,11 +21,10 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs, output_columns
 from softgrasp.fem.petsc import Array, normalising, times_columns, total
 from softgrasp.fem.run.motion import force_values, free_table
-from softgrasp.fem.solve.solvers import choose_solver, make_solver
+from softgrasp.fem.solve.stiffness import factored_stiffness
 
 BLOCKS = 4
 DROPPED = 1e-12  # of the squared length before the projection: directions that are rounding only, or known already
-PREFIX = "softgrasp_accuracy_"
 
 Solve = Callable[[Array], Array]
 
@@ -60,13 +59,8 @@ class KrylovModel:
 @contextmanager
 def static_solves(model: Model) -> Iterator[Solve]:
     """What applies K_ee^-1 to columns, factored once. Collective."""
-    system, time = model.system, model.scene.time
-    name, _ = choose_solver(system.layout, "auto", few=True)
-    solver = make_solver(system.K_ee.copy(), name, system.layout, PREFIX, min(time.rtol, 1e-10), reproducible=False)
-    try:
+    with factored_stiffness(model.system, rtol=min(model.scene.time.rtol, 1e-10)) as solver:
         yield solver.columns
-    finally:
-        solver.destroy()
 
 
 def krylov_model(model: Model) -> KrylovModel:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -67,54 +68,77 @@ def read_csv(path: Path, columns: int, end: float | None = None, key: str = "mot
     return table[:, 0], table[:, 1:]
 
 
-def _target(scene: Scene, n_s: int) -> Array:
-    target = scene.motion.target or []
-    return np.pad(np.array(target, dtype=float), (0, n_s - len(target)))
+@dataclass(frozen=True)
+class Profile:
+    """Time law of the hand: a rest-to-rest quintic to a target (0: at rest), or a table that a CSV file gave."""
+
+    drive: Literal["motion", "force"]  # what it says: the motion of the hand, or the force on it
+    end: float  # of the run [s]
+    target: Array  # of the quintic, (n_s,) [m, rad]
+    duration: float  # of the quintic [s]
+    table: tuple[Array, Array] | None = None  # times (m,) [s] and values (m, n_s) [m, rad; N, N m], or None
+
+    @staticmethod
+    def of(scene: Scene, n_s: int) -> Profile:
+        """The law of a scene. Raises SceneError: a CSV file does not fit."""
+        motion, end = scene.motion, scene.time_end
+        target = np.array(motion.target or [], dtype=float)
+        table = None
+        if motion.profile == "csv":
+            table = read_csv(scene.directory / (motion.csv or ""), n_s, end)
+        return Profile(motion.drive, end, np.pad(target, (0, n_s - len(target))), motion.duration, table)
+
+    @property
+    def fewest(self) -> int:
+        """Steps that a run must have at least."""
+        quintic_moves = self.drive == "motion" and self.table is None and self.target.any()
+        # less rounding, so that half a duration may be a step
+        return max(1, int(np.ceil(2 * self.end / self.duration - 1e-9))) if quintic_moves else 1
+
+    def motion(self, steps: int) -> HandTable:
+        """The hand on a time grid; a table is joined by a cubic spline, at rest at both ends."""
+        t = self.end * np.arange(steps + 1) / steps
+        if self.table is not None:
+            spline = CubicSpline(*self.table, bc_type="clamped")
+            q, v = spline(t), spline(t, 1)
+        else:
+            s, ds, _ = quintic(t, self.duration)
+            q, v = (np.outer(x, self.target) for x in (s, ds))
+        return HandTable(q, v, np.diff(v, axis=0) * (steps / self.end))
+
+    def force(self, steps: int, M_hand: Array) -> Array:
+        """Force u on the hand at the step midpoints, (steps, n_s) [N, N m]; a table is joined by straight lines.
+
+        The quintic is the feed-forward M_hand a(t) that would carry the bare hand to the target.
+        """
+        t = self.end * (np.arange(steps) + 0.5) / steps
+        if self.table is not None:
+            times, values = self.table
+            return np.stack([np.interp(t, times, column) for column in values.T], axis=1)
+        rate = np.where(t < self.duration, quintic(t, self.duration)[2], 0.0)
+        return np.asarray(np.outer(rate, self.target) @ M_hand.T)
 
 
 def motion_table(scene: Scene, n_s: int) -> HandTable:
-    """Positions of the prescribed motion (drive = "motion") on the time grid.
+    """The prescribed motion of a scene (drive = "motion") on its time grid, see :meth:`Profile.motion`.
 
-    A CSV table is joined by a cubic spline, at rest at both ends. Raises SceneError: a CSV file does not fit.
+    Raises SceneError: a CSV file does not fit, or the steps are too long for the move.
     """
-    steps, end = scene.time.steps, scene.time_end
-    t = end * np.arange(steps + 1) / steps
-    motion = scene.motion
-    if motion.profile == "quintic":
-        if end / steps > motion.duration / 2:
-            raise SceneError(
-                f"time.steps = {steps} gives steps of {end / steps:g} s, too long for a move of {motion.duration:g} s; "
-                f"take at least {int(np.ceil(2 * end / motion.duration))}"
-            )
-        s, ds, _ = quintic(t, motion.duration)
-        q, v = (np.outer(x, _target(scene, n_s)) for x in (s, ds))
-    elif motion.profile == "csv":
-        times, values = read_csv(scene.directory / (motion.csv or ""), n_s, end)
-        spline = CubicSpline(times, values, bc_type="clamped")
-        q, v = spline(t), spline(t, 1)
-    else:
-        q, v = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s))
-    return HandTable(q, v, np.diff(v, axis=0) * (steps / end))
+    profile, steps = Profile.of(scene, n_s), scene.time.steps
+    if steps < profile.fewest:
+        raise SceneError(
+            f"time.steps = {steps} gives steps of {profile.end / steps:g} s, too long for a move of "
+            f"{profile.duration:g} s; take at least {profile.fewest}"
+        )
+    return profile.motion(steps)
 
 
 def force_values(scene: Scene, n_s: int, M_hand: Array) -> Array:
-    """Force u [N, N m] on the hand at the step midpoints, shape (steps, n_s).
+    """Force u of a scene on the hand at the step midpoints, (steps, n_s) [N, N m], see :meth:`Profile.force`.
 
-    A CSV table is joined by straight lines.
-
-    With the quintic profile it is the feed-forward M_hand a(t) that would carry the bare hand to the target. Raises
-    SceneError: a CSV file does not fit.
+    Raises SceneError: a CSV file does not fit.
     """
-    steps, end = scene.time.steps, scene.time_end
-    t = end * (np.arange(steps) + 0.5) / steps
-    motion = scene.motion
-    if motion.profile == "quintic":
-        rate = np.where(t < motion.duration, quintic(t, motion.duration)[2], 0.0)
-        return np.outer(rate, _target(scene, n_s)) @ M_hand.T
-    if motion.profile == "csv":
-        times, values = read_csv(scene.directory / (motion.csv or ""), n_s, end)
-        return np.stack([np.interp(t, times, column) for column in values.T], axis=1)
-    return np.zeros((steps, n_s))
+    return Profile.of(scene, n_s).force(scene.time.steps, M_hand)
 
 
 def largest_acceleration(scene: Scene, n_s: int, M_hand: Array) -> Array:
@@ -123,7 +147,7 @@ def largest_acceleration(scene: Scene, n_s: int, M_hand: Array) -> Array:
     Raises SceneError: a CSV file does not fit.
     """
     if scene.motion.profile == "quintic":
-        return np.asarray(10 / np.sqrt(3) / scene.motion.duration**2 * _target(scene, n_s))
+        return np.asarray(10 / np.sqrt(3) / scene.motion.duration**2 * Profile.of(scene, n_s).target)
     if scene.motion.drive == "motion":
         a = motion_table(scene, n_s).a
     else:

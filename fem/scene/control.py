@@ -6,7 +6,7 @@ from itertools import product
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from softgrasp.fem.scene.tissue import Box, Label, Positive, Section, check_box
 
@@ -121,7 +121,14 @@ class Loop(Section):
         description="largest torque on a turning hand about each axis [N m], one number or one per axis; none by "
         "default",
     )
-    delay: bool = Field(False, description="the load acts one sample late [no unit], held only")
+    delay: bool | Annotated[int, Field(ge=0, le=100)] = Field(
+        False, description="samples that the load acts late, true for one [1], held only"
+    )
+
+
+def _with_hyphen(method: str) -> str:
+    """The one way in which a scene is hashed and written."""
+    return method.replace("_", "-")
 
 
 class ControlOutput(Section):
@@ -172,9 +179,9 @@ class Control(Section):
     Q: Weight = Field(1.0, description="weight of the outputs [1/(m2 s)]: number or matrix, positive semidefinite")
     R: Weight = Field(1.0, description="weight of the hand load [1/(N2 s)]: number or matrix, positive definite")
 
-    method: Literal["auto", "newton-adi", "radi", "galerkin", "dense", "modal"] = Field(
-        "auto", description="solver of the Riccati equation [no unit]; auto chooses by size"
-    )
+    method: Annotated[
+        Literal["auto", "newton-adi", "newton_adi", "radi", "galerkin", "dense", "modal"], AfterValidator(_with_hyphen)
+    ] = Field("auto", description="solver of the Riccati equation [no unit]; auto chooses by size")
     tolerance: Annotated[float, Field(gt=0, lt=1)] = Field(
         1e-10, description="relative residual of the Riccati equation [1]"
     )

@@ -103,10 +103,10 @@ def resolved_toml(scene: Scene) -> str:
     for section, key in _FILES:
         if key in data[section]:
             data[section][key] = str(scene.path(data[section][key]))
-    lines = [f"{key} = {_value(value)}" for key, value in data.items() if not isinstance(value, dict)]
+    lines = [f"{key} = {toml_value(value)}" for key, value in data.items() if not isinstance(value, dict)]
     for section, table in data.items():
         if isinstance(table, dict):
-            lines += ["", f"[{section}]"] + [f"{_key(key)} = {_value(value)}" for key, value in table.items()]
+            lines += ["", f"[{section}]"] + [f"{_key(key)} = {toml_value(value)}" for key, value in table.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -208,7 +208,7 @@ def _explain(error: ValidationError, data: dict[str, Any]) -> str:
 
 
 def _show(value: Any) -> str:
-    return shortened(_value(value) if isinstance(value, dict | list | str | bool | int | float) else str(value))
+    return shortened(toml_value(value) if isinstance(value, dict | list | str | bool | int | float) else str(value))
 
 
 def _locate(loc: tuple[int | str, ...], data: Any) -> tuple[list[str], Any]:
@@ -287,15 +287,16 @@ def _choices(annotation: Any) -> list[str]:
 
 
 def _key(key: str) -> str:
-    return key if _BARE.fullmatch(key) else _value(key)
+    return key if _BARE.fullmatch(key) else toml_value(key)
 
 
-def _value(value: Any) -> str:
+def toml_value(value: Any) -> str:
+    """A value as TOML writes it in one line."""
     if isinstance(value, dict):
-        inner = ", ".join(f"{_key(key)} = {_value(item)}" for key, item in value.items())
+        inner = ", ".join(f"{_key(key)} = {toml_value(item)}" for key, item in value.items())
         return f"{{ {inner} }}" if inner else "{}"
     if isinstance(value, list):
-        return "[" + ", ".join(_value(item) for item in value) + "]"
+        return "[" + ", ".join(toml_value(item) for item in value) + "]"
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):

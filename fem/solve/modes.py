@@ -8,12 +8,14 @@ from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc
-from softgrasp.fem.solve.solvers import FEW_LIMIT, SolverName, TissueSolver, make_solver
+from softgrasp.fem.solve.solvers import FEW_LIMIT, SolverName, TissueSolver
+from softgrasp.fem.solve.stiffness import factored_stiffness
 from softgrasp.fem.system import BlockSystem
 
 PREFIX = "softgrasp_modes_"
 TOLERANCE = 1e-11  # of 1/omega^2 in the iteration; rounding in M-products is about 1e-15 n^(1/2)
 RESIDUAL = 1e-8  # bound on the relative error of omega^2 that is let pass
+KEPT_ENTRIES = 50_000_000  # of modes that stay with the system: 400 MB over all ranks
 ROUGH = 1e-3  # tolerance of the search for missed copies: enough when what is left lies ten times as far off
 
 
@@ -22,7 +24,7 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
 
     Krylov-Schur on K_ee^-1 M_ee (shift-and-invert at 0, one Cholesky factor). A second run in the M-orthogonal
     complement catches copies of multiple eigenvalues that one Krylov space cannot see. The sign of a mode does not
-    depend on the rank count. Collective.
+    depend on the rank count. What was computed stays with the system: whoever asks for fewer takes of it. Collective.
 
     ``k``: number of modes, 1 <= k <= n_e.
 
@@ -34,7 +36,20 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
     n_e = system.layout.n_e
     if not 1 <= k <= n_e:
         raise SolverError(f"{k} modes are asked for; it must be between 1 and n_e = {n_e}")
-    solver = _factor(system)
+    key = (system.K_ee.handle, system.K_ee.stateGet(), system.M_ee.handle, system.M_ee.stateGet())
+    kept = system.kept.get("modes")
+    if kept is None or kept[0] != key or len(kept[1]) < k:
+        name: SolverName = "cholesky" if n_e <= FEW_LIMIT[system.layout.dimension] else "mumps"
+        with factored_stiffness(system, name) as solver:
+            kept = key, *_lowest(system, solver, k), system.K_ee, system.M_ee  # none else can take their handles
+        if system.M_ee.getType() != PETSc.Mat.Type.PYTHON and k * n_e <= KEPT_ENTRIES:
+            system.kept["modes"] = kept
+    return kept[1][:k].copy(), kept[2][:, :k].copy(order="F")
+
+
+def _lowest(system: BlockSystem, solver: TissueSolver, k: int) -> tuple[Array, Array]:
+    """The modes, computed. Collective."""
+    n_e = system.layout.n_e
     eps = _make_eps(system, solver)
     vectors: list[PETSc.Vec] = []
     squares: list[float] = []
@@ -54,7 +69,6 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
         return _finish(eps, system, [vectors[i] for i in order])
     finally:
         eps.destroy()
-        solver.destroy()
         for vector in vectors:
             vector.destroy()
 
@@ -77,19 +91,6 @@ class _Factored:
     def apply(self, pc: PETSc.PC, r: PETSc.Vec, w: PETSc.Vec) -> None:
         """Set w = K_ee^-1 r. Collective."""
         self.solver.solve(r, w)
-
-
-def _factor(system: BlockSystem) -> TissueSolver:
-    """The stiffness, factored. Collective."""
-    layout = system.layout
-    name: SolverName = "cholesky" if layout.n_e <= FEW_LIMIT[layout.dimension] else "mumps"
-    try:
-        return make_solver(system.K_ee.copy(), name, layout, PREFIX, reproducible=False)
-    except SolverError as error:
-        raise SolverError(
-            f"modes: the factorisation of the {layout.n_e} x {layout.n_e} stiffness failed ({error}); "
-            "check material, mesh and contact zone"
-        ) from error
 
 
 def _make_eps(system: BlockSystem, solver: TissueSolver) -> SLEPc.EPS:

@@ -11,6 +11,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.scene.scene import Time
 from softgrasp.fem.solve.solvers import Reproducible, SolverName, choose_solver, make_solver
+from softgrasp.fem.solve.stiffness import static_columns
 from softgrasp.fem.system import BlockSystem
 
 if TYPE_CHECKING:
@@ -33,9 +34,7 @@ def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Tim
         return finite_equilibrium(system, solver)
     load, where = (system.G @ system.gravity)[:, None], "the static equilibrium"
     time = time or Time(steps=1, rtol=1e-12)
-    return solve_columns(
-        system.K_ee, system.layout, load, where, time.rtol, solver=solver, reproducible=time.reproducible
-    )[:, 0]
+    return static_columns(system, load, where, time.rtol, solver=solver, reproducible=time.reproducible)[:, 0]
 
 
 def solve_columns(

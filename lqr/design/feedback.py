@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
+import numpy as np
+
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.lqr.design.scene import actuation, control_of, problem, sampling, scene_target
@@ -17,7 +19,7 @@ from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import Target, hand_target, rest
 from softgrasp.lqr.reduced.riccati import GainCheck
-from softgrasp.lqr.riccati import Method, choose, modal_lqr, solve
+from softgrasp.lqr.riccati import Spelling, choose, modal_lqr, solve
 from softgrasp.lqr.spectrum.modal_loop import LoopQuality
 from softgrasp.lqr.spectrum.sampled import Sampling
 
@@ -123,7 +125,7 @@ def _modal(plant: RiccatiProblem, diagnosis: Diagnosis) -> RiccatiSolution:
 
 def _solve(model: Model, plant: RiccatiProblem, progress: Progress | None, checkpoint: Path | None) -> RiccatiSolution:
     control = control_of(model)
-    method = cast(Method, control.method.replace("-", "_"))
+    method = cast(Spelling, control.method)
     tol = None
     # galerkin measures the change of its gain, not the residual
     if "tolerance" in control.model_fields_set and choose(plant, method).method != "galerkin":
@@ -133,7 +135,20 @@ def _solve(model: Model, plant: RiccatiProblem, progress: Progress | None, check
 
 def loop_words(law: Sampling) -> str:
     """Rate and delay of a held loop."""
-    return f"sampled at {1 / (law.dt * law.every):.6g} Hz" + (" and one tick late" if law.delay else "")
+    late = {0: "", 1: " and one tick late"}.get(law.delay, f" and {law.delay} ticks late")
+    return f"sampled at {1 / (law.dt * law.every):.6g} Hz{late}"
+
+
+def running_words(design: Design) -> str:
+    """Which loop runs: its law, rate, delay and limits, behind "the loop"."""
+    law = design.gain_check.law
+    held = law is not None and law.every
+    words = f"{loop_words(law)}, and held" if held and law is not None else "with the continuous law"
+    bound = design.actuation.bound(design.problem.layout.n_s)
+    if bound is None:
+        return words
+    limits = ", ".join("none" if np.isinf(x) else f"{x:.4g}" for x in bound)
+    return f"{words}, the loads limited to {limits}"
 
 
 def _require_sampled(design: Design) -> None:

@@ -11,9 +11,8 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.lqr.design.duration import LoopPlan
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.scene import control_of
-from softgrasp.lqr.loop.gap import duality_gaps
+from softgrasp.lqr.loop.gap import Course, duality_gaps
 from softgrasp.lqr.loop.responses import Notify as Notify
-from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
@@ -24,6 +23,7 @@ FAST_STATES = 8  # of the tissue, up to which a gain is offered for the control 
 MANY_STATES = 200_000  # above, few orders are tried: every gain is certified by solves with the full plant
 WHOLE_SPECTRUM = 500  # n_e from which the Schur form of all modes for every gain takes seconds, so few orders are tried
 FEW_ORDERS = 3
+LONGER = 3  # doublings of a run that has not settled
 
 
 @dataclass(frozen=True)
@@ -96,37 +96,45 @@ def with_bounds[Figures: GainQuality](
     problem: RiccatiProblem,
     solution: RiccatiSolution,
     gains: Iterable[Figures],
-    start: Block,
-    plan: LoopPlan,
+    course: Course,
     notify: Notify | None = None,
 ) -> list[Figures]:
-    """The same with bounds of the cost where the gain is stable, see :mod:`softgrasp.lqr.loop.gap`. Collective.
+    """The same with cost and bounds of the loop as it runs, where the gain is stable. Collective.
 
-    ``cost_excess_proved`` holds for the run to the end of the plan and the optimal feedback after it. What the loop's
-    own way costs after that is an allowance in ``cost_excess_at_most``, at least what the modes kept say of it.
+    See :mod:`softgrasp.lqr.loop.gap`. ``cost_excess_proved`` holds for the run and the optimal feedback after it. What
+    the loop's own way costs after that is an allowance in ``cost_excess_at_most``; while it is more than a tenth of the
+    excess, the run is made twice as long, :data:`LONGER` times at most.
 
     Args:
-        solution: says what is to come after the end of the plan; its error does not matter to the bound.
-        start: start minus target, one column.
+        solution: says what is to come after the end of the run; its error does not matter to the bound.
     """
     gains = list(gains)
     laws: dict[int, Gain] = {i: g.gain for i, g in enumerate(gains) if g.stable and g.gain is not None}
-    if laws:
-        every = [*laws.values(), solution.gain]  # the last has the best lower bound of the least cost
-        gaps = duality_gaps(problem, every, start, plan.dt, plan.steps, solution.factor, notify)
-        for i, gap in zip(laws, gaps[:-1], strict=True):
-            forever = (1 + gains[i].cost_excess) * gaps[-1].cost / gap.least - 1 if gap.least > 0 else float("inf")
-            most = max(gap.cost_excess_at_most, forever)
-            gains[i] = replace(gains[i], cost_excess_at_most=most, cost_excess_proved=gap.cost_excess_proved)
+    if not laws:
+        return gains
+    for more in range(LONGER + 1):
+        longer = replace(course, steps=course.steps << more)
+        gaps = duality_gaps(problem, list(laws.values()), longer, solution, notify)
+        if all(gap.settled or not np.isfinite(gap.gap) for gap in gaps):
+            break
+    for i, gap in zip(laws, gaps, strict=True):
+        gains[i] = replace(
+            gains[i], cost_excess=gap.excess, cost_excess_at_most=gap.cost_excess_at_most,
+            cost_excess_proved=gap.cost_excess_proved, bounded_to=gap.end,
+        )  # fmt: skip
     return gains
+
+
+def course_of(design: Design, plan: LoopPlan) -> Course:
+    """The run of a plan from the scene's start, as its loop is sampled, held, late and limited."""
+    return Course(design.error, plan.dt, plan.steps, design.actuation, design.target.u)
 
 
 def bases_with_bounds(
     design: Design, bases: Sequence[BasisGains], plan: LoopPlan, notify: Notify | None = None
 ) -> tuple[BasisGains, ...]:
     """All gains of all bases from the same few runs. Collective."""
-    every = with_bounds(
-        design.problem, design.solution, (r for b in bases for r in b.reports), design.error, plan, notify
-    )
+    reports = (r for b in bases for r in b.reports)
+    every = with_bounds(design.problem, design.solution, reports, course_of(design, plan), notify)
     rest = iter(every)
     return tuple(replace(b, reports=tuple(next(rest) for _ in b.reports)) for b in bases)

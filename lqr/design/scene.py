@@ -87,7 +87,7 @@ def actuation(model: Model) -> Actuation:
     limits = None
     if loop.limit is not None or loop.limit_torque is not None:
         limits = _per_axis("limit", loop.limit, layout.dimension) + _per_axis("limit_torque", loop.limit_torque, turns)
-    law = Actuation(loop.rate if loop.sampling == "held" else None, loop.delay, limits)
+    law = Actuation(loop.rate if loop.sampling == "held" else None, int(loop.delay), limits)
     law.ticks(scene.time_end / scene.time.steps)
     return law
 

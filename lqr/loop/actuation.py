@@ -18,8 +18,8 @@ class Actuation:
     # samples a second [Hz]; the input is computed at the start of a tick and held (a robot: 1000). None evaluates the
     # law at the midpoint of every step, implicitly: the continuous feedback.
     rate: float | None = None
-    # whether a command acts one tick after its sample; during the first tick u_bar acts. Needs ``rate``.
-    delay: bool = False
+    # ticks from a sample to the load that it commands; until the first one acts, u_bar does. Needs ``rate``.
+    delay: int = 0
     # bound on |u_i| [N, N m], a number or one per input (may be inf); None for none
     limits: float | tuple[float, ...] | None = None
 
@@ -47,8 +47,10 @@ class Actuation:
         """
         if self.rate is None:
             if self.delay:
-                raise ControlError("delay = true needs a rate: continuous feedback has no tick to wait for")
+                raise ControlError(f"delay = {self.delay} needs a rate: continuous feedback has no tick to wait for")
             return 0
+        if self.delay < 0:
+            raise ControlError(f"delay = {self.delay} ticks must be 0 or more")
         if not (np.isfinite(self.rate) and self.rate > 0):
             raise ControlError(f"rate = {self.rate} Hz must be a positive number")
         ratio = 1.0 / (self.rate * dt)

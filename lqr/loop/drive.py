@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import deque
 from typing import Any, cast
 
 import numpy as np
@@ -98,16 +99,16 @@ class ImplicitDrive(GainDrive):
 
 
 class HeldDrive(GainDrive):
-    """u = clip(u_bar + K (x - x_bar)) sampled at the start of a tick and held, if asked for one tick later.
+    """u = clip(u_bar + K (x - x_bar)) sampled at the start of a tick and held, if asked for some ticks later.
 
     ``target``: x_bar and u_bar; u_bar acts until the first command arrives.
     """
 
     def __init__(self, plant: HandStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
         super().__init__(plant, gain, target, actuation, steps)
-        self.every, self.delay = actuation.ticks(plant.dt), actuation.delay
+        self.every = actuation.ticks(plant.dt)
         self.K = np.vstack([gain.K_z, gain.K_v])
-        self.held = self.waiting = self._clip(target.u)
+        self.waiting = deque([self._clip(target.u)] * (actuation.delay + 1), actuation.delay + 1)
 
     def _clip(self, u: Array) -> Array:
         return np.array(u) if self.bound is None else np.clip(u, -self.bound, self.bound)
@@ -117,9 +118,8 @@ class HeldDrive(GainDrive):
         if n % self.every == 0:
             tissue = total(self.plant.comm, self.K.T @ state.array)
             hand = self.gain.K_s @ np.concatenate([self.q[n], self.v[n]])
-            new = self._clip(self.offset + hand + tissue)
-            self.held, self.waiting = (self.waiting, new) if self.delay else (new, new)
-        self.push(n, self.held, state)
+            self.waiting.append(self._clip(self.offset + hand + tissue))
+        self.push(n, self.waiting[0], state)
 
 
 class OpenDrive(LoopDrive):

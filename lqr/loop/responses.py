@@ -10,6 +10,7 @@ import numpy as np
 import scipy.fft
 
 from softgrasp.fem.petsc import Array, total
+from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.loop.drive import OpenDrive
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopRun
 from softgrasp.lqr.plant.block import Block
@@ -51,20 +52,54 @@ def causal(kernel: Array, x: Array) -> Array:
     return np.asarray(scipy.fft.irfft(both, size, axis=0)[:steps])
 
 
-def feedback_inputs(law: Responses) -> Array:
-    """u_n = K x_mid of every step, from the responses of K' at the midpoints; (steps, n_s).
+def loop_inputs(law: Responses, actuation: Actuation, u_bar: Array) -> Array:
+    """Inputs u_n - u_bar of every step under u = u_bar + K (x - x_bar) as it reaches the hand; (steps, n_s).
 
-    Row by row of (I - kernel_0) u_n = free_n + sum_{k < n} kernel_{n-k} u_k.
+    The same inputs as those of :mod:`softgrasp.lqr.loop.drive`, row by row: sampled, held, late and limited, or at the
+    midpoint of every step, u_n = clip(u_bar + K (x_mid - x_bar)).
+
+    Args:
+        law: responses of K' at the grid points.
+        u_bar: steady input [N, N m], (n_s,).
+
+    Raises ControlError, SolverError: as the loop itself does, see :class:`softgrasp.lqr.loop.actuation.ImplicitInput`.
     """
-    steps, n_s = law.free.shape
-    inverse = np.linalg.inv(np.eye(n_s) - law.kernel[0])
-    backwards = np.ascontiguousarray(law.kernel[::-1].transpose(1, 0, 2)).reshape(n_s, steps * n_s)
-    u = np.zeros((steps, n_s))
-    past, end = u.reshape(-1), (steps - 1) * n_s
+    every = actuation.ticks(law.dt)
     with np.errstate(over="ignore", invalid="ignore"):  # of a gain that does not stabilise
-        for n in range(steps):
-            u[n] = inverse @ (law.free[n] + backwards[:, end - n * n_s : end] @ past[: n * n_s])
+        return _held(law, actuation, u_bar, every) if every else _implicit(law.at_midpoints(), actuation, u_bar)
+
+
+def _implicit(law: Responses, actuation: Actuation, u_bar: Array) -> Array:
+    """(I - kernel_0) u_n = free_n + sum_{k < n} kernel_{n-k} u_k, between the limits."""
+    steps, n_s = law.free.shape
+    bound, u = actuation.bound(n_s), np.zeros((steps, n_s))
+    step, steady = ImplicitInput(law.kernel[0], bound), np.zeros(n_s) if bound is None else u_bar
+    backwards, past = _backwards(law.kernel), u.reshape(-1)
+    shift, end = steady - law.kernel[0] @ steady, (steps - 1) * n_s
+    for n in range(steps):
+        u[n] = step.solve(shift + law.free[n] + backwards[:, end - n * n_s : end] @ past[: n * n_s]) - steady
     return u
+
+
+def _held(law: Responses, actuation: Actuation, u_bar: Array, every: int) -> Array:
+    """w_{m + delay} = free + sum_{j < m} (sum of the kernel over tick m - j) w_j at tick m, between the limits."""
+    n_s, delay = len(u_bar), actuation.delay
+    bound, ticks = actuation.bound(n_s), -(-law.steps // every)
+    low, high = (-np.inf, np.inf) if bound is None else (-bound - u_bar, bound - u_bar)
+    whole = law.kernel[1 : 1 + (ticks - 1) * every].reshape(ticks - 1, every, n_s, n_s).sum(axis=1)
+    backwards, end = _backwards(whole), (ticks - 1) * n_s
+    w = np.clip(np.zeros((ticks + delay, n_s)), low, high)
+    past = w.reshape(-1)
+    for m in range(ticks):
+        wish = law.free[m * every] + backwards[:, end - m * n_s :] @ past[: m * n_s]
+        w[m + delay] = np.clip(wish, low, high)
+    return np.repeat(w[:ticks], every, axis=0)[: law.steps]
+
+
+def _backwards(kernel: Array) -> Array:
+    """[kernel_last, .., kernel_0] side by side, (n_s, len n_s)."""
+    n_s = kernel.shape[-1]
+    return np.ascontiguousarray(kernel[::-1].transpose(1, 0, 2)).reshape(n_s, len(kernel) * n_s)
 
 
 def responses(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -245,13 +246,11 @@ class ReducedLoop:
     def _held(self, states: Array, inputs: Array, K: Array, offset: Array, u_bar: Array, actuation: Actuation) -> None:
         bound, every = actuation.bound(len(u_bar)), actuation.ticks(self.dt)
         limit = np.full(len(u_bar), np.inf) if bound is None else bound
-        held = waiting = np.clip(u_bar, -limit, limit)
+        waiting = deque([np.clip(u_bar, -limit, limit)] * (actuation.delay + 1), actuation.delay + 1)
         step, shift = 2 * self.P - np.eye(len(self.P)), 2 * self.b
-        drive = shift + 2 * self.Y @ held
         for n in range(len(inputs)):
             if n % every == 0:
-                new = np.clip(offset + K @ states[n], -limit, limit)
-                held, waiting = (waiting, new) if actuation.delay else (new, new)
-                drive = shift + 2 * self.Y @ held
-            inputs[n] = held
+                waiting.append(np.clip(offset + K @ states[n], -limit, limit))
+                drive = shift + 2 * self.Y @ waiting[0]
+            inputs[n] = waiting[0]
             states[n + 1] = step @ states[n] + drive

@@ -48,14 +48,16 @@ class GainQuality:
     """A gain against the optimal one, on the full plant; nan where there is none."""
 
     error_K: float = NAN  # noqa: N815  ||K - K_hat||_F / ||K||_F in the paper's coordinates
-    cost_excess: float = NAN  # J(K_hat) / J(K) - 1 from the scene's start on the full plant
+    # J(K_hat) / J(K) - 1 from the scene's start: of the continuous law, or with bounds of the loop as it runs
+    cost_excess: float = NAN
     abscissa_full: float = NAN  # largest real part of the full closed loop [1/s]
     reason: str = ""  # why there is no gain; empty when there is one
     certified: bool = True  # the sign of the abscissa is certain, see LoopQuality
     sampled: SampledRadius | None = None  # the loop from tick to tick, where its instants are known
     gain: Gain | None = None  # K_hat; None where there is none
-    cost_excess_at_most: float = NAN  # bound on the excess; nan where not asked for
+    cost_excess_at_most: float = NAN  # bound on the excess of the loop as it runs; nan where not asked for
     cost_excess_proved: float = NAN  # the part that is proved, see softgrasp.lqr.design.orders.with_bounds
+    bounded_to: float = NAN  # end of the run behind the two bounds [s]
 
     @property
     def stable(self) -> bool:
@@ -71,7 +73,11 @@ class GainQuality:
         if not self.stable:
             known = self.certified and (self.sampled is None or self.sampled.certified)
             return "the full loop is unstable" if known else "the full loop is not certified to be stable"
-        return "no bound was asked for" if np.isnan(self.cost_excess_at_most) else "the cost of the run overflows"
+        if np.isnan(self.cost_excess_at_most):
+            return "no bound was asked for"
+        if np.isfinite(self.cost_excess_proved):
+            return f"the loop as it runs does not settle within {self.bounded_to:.4g} s"
+        return "the cost of the run overflows"
 
 
 @dataclass(frozen=True)
@@ -139,6 +145,12 @@ def gain_error(problem: RiccatiProblem, gain: Gain, gain_hat: Gain) -> float:
     system, K, K_hat = problem.system, gain.block, gain_hat.block
     difference = gain_to_absolute(system, Block(K.hand - K_hat.hand, K.tall - K_hat.tall))
     return norm(problem, difference) / norm(problem, gain_to_absolute(system, K))
+
+
+def tissue_gain_error(problem: RiccatiProblem, gain: Gain, gain_hat: Gain) -> float:
+    """The same of the tissue's rows alone, beside which those of a heavy hand are large. Collective."""
+    K, K_hat, none = gain.block, gain_hat.block, np.zeros((0, len(gain.K_s)))
+    return norm(problem, Block(none, K.tall - K_hat.tall)) / (norm(problem, Block(none, K.tall)) or 1.0)
 
 
 class GainCheck:

@@ -30,7 +30,7 @@ class Sampling:
 
     dt: float  # time step of the midpoint rule [s]
     every: int = 0  # steps in one tick, during which the input is held; 0 takes the law at the midpoint of every step
-    delay: bool = False  # a command acts one tick after its sample
+    delay: int = 0  # ticks from a sample to the load that it commands
 
     @classmethod
     def of(cls, actuation: Actuation, dt: float) -> Sampling:
@@ -95,7 +95,7 @@ def tick(A: Array, B: Array, law: Sampling) -> tuple[Array, Array]:
 
 
 class SampledLoop:
-    """The plant from tick to tick: x+ = A_d x + B_d w, w+ = K x with a delay, else x+ = (A_d + B_d K) x.
+    """The plant from tick to tick: x+ = A_d x + B_d w_1, w_1+ = w_2, .., w_delay+ = K x, or x+ = (A_d + B_d K) x.
 
     Small plants keep all modes. A large one whose damping decouples its modes (one-way those of the clamped tissue,
     two-way those with the hand floating) keeps the lowest. With L the loop of the modes kept and D(z) that of the rest,
@@ -220,11 +220,10 @@ def _conclude(parts: _Parts, law: Sampling) -> SampledRadius:
     """Eigenvalues of the modes kept, and the bound on the rest."""
     A_d, B_d = tick(parts.A, parts.B, law)
     m = B_d.shape[1]
+    T = _late(A_d, B_d, parts.k, law.delay)
+    enter, leave = B_d, parts.k
     if law.delay:
-        T = np.block([[A_d, B_d], [parts.k, np.zeros((m, m))]])
-        enter, leave = np.vstack([np.zeros_like(B_d), np.eye(m)]), np.eye(m, len(T), len(A_d))
-    else:
-        T, enter, leave = A_d + B_d @ parts.k, B_d, parts.k
+        enter, leave = np.eye(len(T), m, m - len(T)), np.eye(m, len(T), len(A_d))
     if not np.isfinite(T).all():
         return SampledRadius(np.inf)
     if parts.rest is None:
@@ -238,6 +237,17 @@ def _conclude(parts: _Parts, law: Sampling) -> SampledRadius:
         if not gain < SAFE:
             reason = f"the gain reaches modes that were left out: the small gain is {gain:.2g}, not below {SAFE:g}"
     return SampledRadius(size, not reason, False, reason)
+
+
+def _late(A: Array, B: Array, k: Array, delay: int) -> Array:
+    """[x, w_1, .., w_delay] from tick to tick, the commands under way behind the state."""
+    n, m = B.shape
+    if not delay:
+        return np.asarray(A + B @ k)
+    T = np.eye(n + delay * m, k=m)  # w_i+ = w_{i+1}
+    T[:n], T[-m:] = 0.0, 0.0
+    T[:n, :n], T[:n, n : n + m], T[-m:, :n] = A, B, k
+    return T
 
 
 def _small_gain(values: np.ndarray, ends: tuple[np.ndarray, np.ndarray], rest: _Rest, law: Sampling) -> float:
@@ -300,5 +310,5 @@ def _carried(A: Array, B: Array, K: Controller, law: Sampling) -> SampledRadius:
     moved = (accelerated + drag) @ C_v  # what an increment of x+ does to y+
     free = np.block([[A_d, np.zeros((n, len(step)))], [moved @ A_d - (accelerated - drag) @ C_v, step]])
     push = np.vstack([B_d, moved @ B_d])
-    T = np.block([[free, push], [gain, np.zeros((n_s, n_s))]]) if law.delay else free + push @ gain
+    T = _late(free, push, gain, law.delay)
     return SampledRadius(float(np.abs(np.linalg.eigvals(T)).max()))

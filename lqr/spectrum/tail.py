@@ -6,6 +6,7 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.solve.statics import solve_columns
+from softgrasp.fem.solve.stiffness import static_columns
 from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.lowrank.modal_start import plant_modes
 from softgrasp.lqr.lowrank.plant import Plant
@@ -89,7 +90,7 @@ class Tail:
         # the rest itself: as a difference of norms it would lose half the digits
         rest = columns - _moved_mass(problem, Phi) @ size
         self.rest_z, self.rest_v, self.rest_force = _norms(problem, rest, _inverse_mass(problem, rest), 3)
-        static = solve_columns(system.K_ee, problem.layout, rest[:, 2 * n_s :])
+        static = static_columns(system, rest[:, 2 * n_s :])
         (self.rest_static,) = _norms(problem, static, _moved_mass(problem, static), 1)
 
     def bound(self, r: float, a: float = 0.0) -> float:

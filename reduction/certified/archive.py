@@ -16,6 +16,7 @@ import numpy as np
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.motion import Profile
 from softgrasp.reduction.archive import LINEAR, about, read_linear, reading, write_model, write_small
 from softgrasp.reduction.certified.certificate import MeshNumber
 from softgrasp.reduction.certified.model import Box, CertifiedModel
@@ -69,7 +70,17 @@ def _write(model: CertifiedModel, group: h5py.Group) -> None:
             part["q_s"], part["v_s"] = drive.hand
         if drive.force is not None:
             part["force"] = drive.force
+        if drive.profile is not None:
+            _write_profile(drive.profile, part.create_group("profile"))
         drive, name = drive.finer, "finer"
+
+
+def _write_profile(profile: Profile, part: h5py.Group) -> None:
+    for key in ("drive", "end", "duration"):
+        part.attrs[key] = getattr(profile, key)
+    part["target"] = profile.target
+    if profile.table is not None:
+        part["times"], part["values"] = profile.table
 
 
 def load_certified(path: str | Path, layout: BlockLayout | None = None) -> CertifiedModel:
@@ -120,4 +131,11 @@ def _about(data: dict[str, Any], static: Array, mass: Array, shape: tuple[Array,
 def _read_drive(part: h5py.Group, finer: Drive | None) -> Drive:
     hand = (part["q_s"][()], part["v_s"][()]) if "q_s" in part else None
     force = part["force"][()] if "force" in part else None
-    return Drive(float(part.attrs["dt"]), hand, force, part.attrs["start"], finer)
+    profile = _read_profile(part["profile"]) if "profile" in part else None
+    return Drive(float(part.attrs["dt"]), hand, force, part.attrs["start"], finer, profile)
+
+
+def _read_profile(part: h5py.Group) -> Profile:
+    table = (part["times"][()], part["values"][()]) if "times" in part else None
+    about = part.attrs
+    return Profile(about["drive"], float(about["end"]), part["target"][()], float(about["duration"]), table)

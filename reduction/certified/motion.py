@@ -11,7 +11,7 @@ import scipy.linalg
 
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.motion import driven_table
+from softgrasp.fem.run.motion import Profile, driven_table
 from softgrasp.reduction import online
 from softgrasp.reduction.certified.bounds import lengths, nodal
 from softgrasp.reduction.certified.oscillators import Modes, SecondOrder, march
@@ -21,6 +21,8 @@ from softgrasp.reduction.online import ReducedTrajectory, consistent
 from softgrasp.reduction.propagator import propagator
 
 Materials = tuple[LayerMaterial, ...]
+Start = Literal["rest", "equilibrium"]
+FINER = 8  # steps for one, of the runs that tell the error of the step
 SLOW = 0.25  # angle of a mode in a step below which smoothing its residual gains about 1 % of the bound
 
 
@@ -31,8 +33,22 @@ class Drive:
     dt: float  # step [s]
     hand: tuple[Array, Array] | None = None  # q_s and v_s, (steps + 1, n_s) each [m, rad; m/s, rad/s]
     force: Array | None = None  # u, (steps, n_s) [N, N m]
-    start: Literal["rest", "equilibrium"] = "rest"  # "rest", or "equilibrium" under gravity
+    start: Start = "rest"  # "rest", or "equilibrium" under gravity
     finer: Drive | None = None  # the same motion at a step some times smaller, for the error of the step
+    profile: Profile | None = None  # the time law behind the tables; None: not known
+
+    @staticmethod
+    def along(profile: Profile, steps: int, M_hand: Array, start: Start, finer: int = FINER) -> Drive:
+        """A time law at some steps, and at ``finer`` times as many (1: not)."""
+
+        def at(count: int) -> Drive:
+            dt = profile.end / count
+            if profile.drive == "force":
+                return Drive(dt, force=profile.force(count, M_hand), start=start)
+            table = profile.motion(count)
+            return Drive(dt, hand=(table.q, table.v), start=start)
+
+        return replace(at(steps), finer=at(finer * steps) if finer > 1 else None, profile=profile)
 
     @property
     def steps(self) -> int:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.motion import force_values, motion_table
+from softgrasp.fem.run.motion import Profile
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.reduction.certified.motion import Drive
+from softgrasp.reduction.certified.motion import FINER, Drive
 from softgrasp.reduction.certified.residual import ResidualSpace, kinematic_triangles
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.reduce import project_scene
@@ -19,8 +19,6 @@ from softgrasp.reduction.reduce import project_scene
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
     from softgrasp.fem.scene.scene import Scene
-
-FINER = 8  # steps for one, of the run that measures the error of the step
 
 
 def second_order_basis(model: Model, Phi: Array, name: str = "certified") -> Basis:
@@ -41,19 +39,7 @@ def scene_drive(scene: Scene, M_hand: Array, finer: int = FINER) -> Drive:
     Raises:
         SceneError: a CSV file does not fit.
     """
-    n_s, steps = len(M_hand), scene.time.steps
-    dt, start = scene.time_end / steps, scene.time.start
-    if scene.motion.drive == "motion":
-        table = motion_table(scene, n_s)
-        drive = Drive(dt, hand=(table.q, table.v), start=start)
-    else:
-        drive = Drive(dt, force=force_values(scene, n_s, M_hand), start=start)
-    if finer <= 1:
-        return drive
-    time = scene.time.model_copy(update={"steps": finer * steps})
-    other = scene.model_copy(update={"time": time})
-    other._directory = scene._directory
-    return replace(drive, finer=scene_drive(other, M_hand, 1))
+    return Drive.along(Profile.of(scene, len(M_hand)), scene.time.steps, M_hand, scene.time.start, finer)
 
 
 def certified_model(

@@ -21,7 +21,15 @@ from softgrasp.lqr.design.controller import CertifiedController, NoController, c
 from softgrasp.lqr.design.duration import LoopPlan, largest_cost
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.linearise import finite_problem
-from softgrasp.lqr.design.orders import BasisGains, Notify, best_gains, fast_order, reduce_gains, with_bounds
+from softgrasp.lqr.design.orders import (
+    BasisGains,
+    Notify,
+    best_gains,
+    course_of,
+    fast_order,
+    reduce_gains,
+    with_bounds,
+)
 from softgrasp.lqr.loop.controller import Controller, save_gain
 from softgrasp.lqr.loop.cost import overshoot, predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory
@@ -196,7 +204,7 @@ def retune(
         gain_check = cache(partial(_gain_check, problem, design))
         points = [_at(tuner, materials, gain_check) for tuner in tuners]
         if any(point.gain is not None for point in points):
-            points = with_bounds(problem, gain_check().solution, points, design.error, plan)
+            points = with_bounds(problem, gain_check().solution, points, course_of(design, plan))
         columns.append([replace(point, gain=None) for point in points])
         notify(done, len(settings))
     rows = zip(*columns, strict=True)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem.columns import hand_columns
-from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.design.feedback import Design, running_words
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.margins import LoopMargins
-from softgrasp.lqr.plant.problem import rigid_gains
+from softgrasp.lqr.plant.problem import RiccatiSolution, rigid_gains
 from softgrasp.lqr.reduced.riccati import GainQuality
-from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, radius_of, settled
+from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, gain_change, radius_of, settled
 from softgrasp.study.forward.result import trajectory_header
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation import control_equation
@@ -22,7 +22,7 @@ from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
 
 Row = tuple[Any, ...]
-EXCESS = ("excess cost", "proved to the end", "at most")
+EXCESS = ("excess cost as it runs", "proved to the end", "at most")
 SPECTRUM = ("abscissa [1/s]", "radius a tick")
 REDUCED_HEADER = ("basis", "N", "error of P", "error of K", *EXCESS, *SPECTRUM, "reduced ARE [ms]", "gain")
 BOX_HEADER = ("lambda [Pa]", "mu [Pa]", "error of K", *EXCESS, *SPECTRUM, "re-tuned in [ms]", "gain")
@@ -56,6 +56,7 @@ def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[st
         ("method", solution.summary),
         ("rank, Newton steps, solves", ", ".join(counts)),
         ("true relative residual", f"{solution.residual:.1e}"),
+        *_settled_gain(solution),
         ("optimal cost from the start", f"{study.design.gain_check.optimal:.6g}"),
         *_spectrum(study.design),
         ("gain, body displaced", displaced),
@@ -82,16 +83,32 @@ def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[st
         up = f"to {high:.3g}" if high < 1e3 else "or more"
         rows.append(("its margins, all inputs at once", f"gain x {low:.3g} {up}, phase {phase:.3g} deg"))
     if whole is not None:
+        if whole.bases:
+            rows.append(("excess cost is that of the loop", running_words(study.design)))
         rows += [("re-tuned", _fast(r)) for r in whole.retuned]
         stages = ", ".join(f"{seconds.get(k, 0.0):.3g} s" for k in ("are", "reduced", "loop"))
         rows.append(("time: ARE, reduced, loop", stages))
     return rows
 
 
+def _settled_gain(solution: RiccatiSolution) -> list[tuple[str, str]]:
+    """Of a Galerkin gain the changes between the last two spaces: its residual says little of the gain."""
+    change = gain_change(solution)
+    text = change and f"rows of the hand {change['hand']:.1e}, of the tissue {change['tissue']:.1e}"
+    return [("last change of the gain", text)] if text else []
+
+
 def summary(study: GainStudy) -> list[str]:
     """What came out, in three sentences."""
     design, optimal = study.design, study.design.gain_check.optimal
-    first = f"The Riccati equation is solved to the relative residual {design.solution.residual:.1e}."
+    first, solved = f"The Riccati equation is solved to the relative residual {design.solution.residual:.1e}.", ""
+    change = gain_change(design.solution)
+    if change is not None:
+        first = solved = (
+            f"The Riccati equation is solved by a Galerkin method: its true relative residual is "
+            f"{design.solution.residual:.1e}; between the last two spaces the gain changed by {change['hand']:.1e} in "
+            f"the rows of the hand and by {change['tissue']:.1e} in those of the tissue."
+        )
     cost = f"The move costs {optimal:.4g} at least; the abscissa of its loop is {design.quality.abscissa:.3g} 1/s."
     if isinstance(study, ControlStudy):
         full = study.loops.full
@@ -99,7 +116,7 @@ def summary(study: GainStudy) -> list[str]:
         reaches = "does not settle within 1 % of the way in this run" if arrived is None else (
             f"reaches the target, within 1 % of the way, in {arrived:.3g} s"
         )  # fmt: skip
-        first = f"The optimal gain {reaches}."
+        first = f"The optimal gain {reaches}. {solved}".rstrip()
         cost = f"The move costs {paid:.4g}; the Riccati equation predicts {optimal:.4g}."
         if full.saturated:
             excess = (paid + study.loops.to_come) / optimal - 1
@@ -266,12 +283,15 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
 
 def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Section]:
     plan = study.loops.plan
+    end = max((r.bounded_to for b in study.bases for r in b.reports if r.stable), default=plan.dt * plan.steps)
     text = (
         "Each equation is projected on N basis vectors and solved; its gain is tested on the full plant. The bases "
         "of the paper need P first, the a-priori modes do not. Only stable gains are offered as controllers. "
-        "The excess cost is J/J* - 1 on the modes kept. The first bound beside it is proved for the whole plant, by "
-        f"the duality gap, for the run to t = {plan.dt * plan.steps:.4g} s and the optimal feedback after it; the "
-        "second makes room for what the gain's own way costs after that time, which is an allowance, not a proof."
+        f"Excess cost and its bounds are those of the loop as it runs: {running_words(study.design)}. The excess cost "
+        "is J/J* - 1 over the least cost J* of all inputs, which need not be held, wait or keep a limit. The first "
+        f"bound beside it is proved for the whole plant, by the duality gap, for the run to t = {end:.4g} s and the "
+        "optimal feedback after it; the second makes room for what the loop's own way costs after that time, which is "
+        "an allowance, not a proof."
     )
     none = [(f"{TITLES[b.name]}, N = {r.N}", r.unbounded) for b in study.bases for r in b.reports if r.unbounded]
     parts = [reduced_table(study.bases).section(text, figures=figures)]

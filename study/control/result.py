@@ -13,11 +13,11 @@ from softgrasp.fem.columns import farthest
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.controller import CertifiedController
 from softgrasp.lqr.design.duration import LoopPlan
-from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.design.feedback import Design, running_words
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
-from softgrasp.lqr.plant.problem import rigid_gains, translation_defect, velocity_defect
+from softgrasp.lqr.plant.problem import RiccatiSolution, rigid_gains, translation_defect, velocity_defect
 from softgrasp.lqr.plant.target import Target
 from softgrasp.lqr.reduced.retune import RetunedGain
 from softgrasp.lqr.reduced.riccati import GainQuality
@@ -34,7 +34,7 @@ TITLES = {
 }
 
 REPORT = ("N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are", "stable", "certified", "reason")
-BOUNDS = ("cost_excess_proved", "cost_excess_at_most", "unbounded")
+BOUNDS = ("cost_excess_proved", "cost_excess_at_most", "bounded_to", "unbounded")
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class GainStudy:
     @cached_property
     def margins(self) -> LoopMargins | None:
         """Of the loop under the small controller, on the plant that it was made for."""
-        return loop_margins(self.controller.controller, int(self.design.actuation.delay)) if self.controller else None
+        return loop_margins(self.controller.controller, self.design.actuation.delay) if self.controller else None
 
     @property
     def findings(self) -> list[str]:
@@ -138,6 +138,7 @@ class GainStudy:
             "rank": solution.rank,
             **{key: solution.counts.get(key, 0) for key in ("newton_steps", "adi_steps", "solves")},
             "residual": solution.residual,
+            "gain_change": gain_change(solution),
             "optimal_cost": d.gain_check.optimal,
             "gain_translation": displaced.tolist(),
             "gain_rigid_velocity": moving.tolist(),
@@ -172,12 +173,19 @@ class ControlStudy(GainStudy):
     def result(self, seconds: dict[str, float]) -> dict[str, Any]:
         """The keys of ``result.json``. Collective."""
         return super().result(seconds) | {
+            "bounded_loop": running_words(self.design),
             "reduced": {b.name: [report_dict(r, REPORT + BOUNDS) for r in b.reports] for b in self.bases},
             "refused": {b.name: b.refused for b in self.bases if b.refused},
             "retune": [_retuned(r) for r in self.retuned],
             "loop": _loop(self),
             **({} if self.finite is None else {"finite_strain": _finite(self.finite)}),
         }
+
+
+def gain_change(solution: RiccatiSolution) -> dict[str, float] | None:
+    """How much hand's and tissue's rows of a Galerkin gain changed between its last two spaces; else None."""
+    last = solution.history[-1] if solution.method == "galerkin" else None
+    return last and {key: last[f"change_{key}"] for key in ("hand", "tissue")}
 
 
 def report_dict(gain: GainQuality, keys: Sequence[str] = REPORT) -> dict[str, Any]:

@@ -1,10 +1,9 @@
-"""How far a result is from that of an infinitely fine mesh and step: as numbers, sentences and a picture."""
+"""How far a result is from that of an infinitely fine mesh and step: as numbers and sentences."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -102,28 +101,3 @@ def accuracy_report(result: MeshEstimate | None, run: Trajectory) -> AccuracyRep
         summary=[f"The deformation is about {off} off by the mesh and {in_time} by the time step."],
         warnings=warnings,
     )
-
-
-def draw(out_png: Path, run: Trajectory, result: MeshEstimate) -> tuple[Path, ...]:
-    """Outputs against the hand, y and y + delta y, with the band of the bound; PNG and PDF."""
-    import matplotlib.pyplot as plt
-
-    from softgrasp.study.pictures.style import COLUMN, CYCLE, length_unit, paper_style, save
-
-    relative = run.outputs - run.outputs_rigid
-    shown = [i for i in range(relative.shape[1]) if np.abs(relative[:, i]).max() > 0][:6]
-    corrected = relative + result.delta
-    band = result.bound * np.linalg.norm(corrected, axis=1).max()
-    factor, unit = length_unit(float(np.abs(relative).max(initial=0.0)))
-    with paper_style():
-        figure, ax = plt.subplots(figsize=(COLUMN, 2.4), layout="constrained")
-        for k, i in enumerate(shown):
-            color = CYCLE[k % len(CYCLE)]
-            y, name = factor * relative[:, i], run.output_names[i]
-            ax.fill_between(run.times, y - factor * band, y + factor * band, color=color, alpha=0.15, lw=0)
-            ax.plot(run.times, y, color=color, label=f"{name} of this mesh")
-            ax.plot(run.times, factor * corrected[:, i], color=color, ls="--", label=f"{name} corrected")
-        ax.set_xlabel("time [s]")
-        ax.set_ylabel(f"relative to hand [{unit}]")
-        figure.legend(loc="outside upper center", ncols=2)
-        return save(figure, out_png)

@@ -16,7 +16,7 @@ from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError,
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.run.checkpoint import check_ranks
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, draw, estimate_error
+from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estimate_error
 from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
@@ -93,7 +93,9 @@ def run_simulate(
     def page() -> Page:
         drawn = frames.draw(out, run)
         if session.pictures and mesh_error is not None:
-            drawn += draw(out / "mesh_error.png", run, mesh_error)
+            from softgrasp.study.forward.plots import figure_mesh_error  # brings Matplotlib
+
+            drawn += figure_mesh_error(out / "mesh_error.png", run, mesh_error)
         sections = _sections(result, rows, drawn)
         return Page(scene.name, [*result.summary(), *accuracy.summary], sections, tables, [*fields, *drawn])
 

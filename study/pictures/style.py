@@ -27,6 +27,7 @@ OUTLINE = "#555555"
 TARGET = ORANGE
 CYCLE = (BLUE, ORANGE, GREEN, PURPLE)
 COLUMN, WIDTH = 3.4, 7.0  # [inch], one column and both of a two-column page
+FULL: dict[str, Any] = {"color": "#888888", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}  # a full run beside reduced ones
 DPI = 150
 STEPS = [1, 2, 5, 10]  # between ticks
 

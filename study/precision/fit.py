@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.study.precision.points import WorkPoint
-from softgrasp.study.reduce.result import unbeaten
+from softgrasp.study.reduce.linear.result import unbeaten
 from softgrasp.study.shell.timing import power_law
 
 GAIN = 0.01  # of the error: what a slower point must gain to be on the front

@@ -36,7 +36,7 @@ from softgrasp.study.precision.tables import (
     reference_text,
     slope_table,
 )
-from softgrasp.study.reduce.measure import PAPER_FULL, PAPER_REDUCED
+from softgrasp.study.reduce.linear.measure import PAPER_FULL, PAPER_REDUCED
 from softgrasp.study.report.equation import control_equation
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import command_line, origin, peak_memory_mb

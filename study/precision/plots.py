@@ -16,7 +16,7 @@ from softgrasp.lqr.reduced.bases import BASES
 from softgrasp.reduction.bases.registry import METHODS
 from softgrasp.study.control.plots import LOOKS as BASIS_LOOKS
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
-from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, UNSTABLE, WIDTH, paper_style, save
+from softgrasp.study.pictures.style import BLUE, FULL, GREEN, HAND, ORANGE, PURPLE, UNSTABLE, WIDTH, paper_style, save
 from softgrasp.study.precision.fit import Slope, pareto, series_of, usable
 from softgrasp.study.precision.forward import on_meshes, over_steps
 from softgrasp.study.precision.points import (
@@ -30,8 +30,8 @@ from softgrasp.study.precision.points import (
 )
 from softgrasp.study.precision.riccati import TITLES
 from softgrasp.study.precision.tables import PAPER_ARE, PAPER_N, PAPER_SMALL
-from softgrasp.study.reduce.measure import PAPER_FULL, PAPER_REDUCED
-from softgrasp.study.reduce.plots import FULL, looks
+from softgrasp.study.reduce.linear.measure import PAPER_FULL, PAPER_REDUCED
+from softgrasp.study.reduce.linear.plots import looks
 
 ORDER_LOOK = {1: (BLUE, "o"), 2: (ORANGE, "s"), 3: (GREEN, "^")}
 SERIES_LOOK = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PURPLE, "D"), (HAND, "v"))

@@ -121,7 +121,7 @@ class ForwardPoint(RunPoint):
 
 @dataclass(frozen=True, kw_only=True)
 class ReducedPoint(RunPoint):
-    """A run of a reduced model; what is not named here is as in :class:`softgrasp.study.reduce.measure.Point`."""
+    """A run of a reduced model; what is not named here is as in :class:`softgrasp.study.reduce.linear.result.Point`."""
 
     question: ClassVar[str] = "reduced"
     method: str

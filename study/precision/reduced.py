@@ -27,8 +27,8 @@ from softgrasp.study.precision.full import FullRuns, Series, errors_of
 from softgrasp.study.precision.points import BasisPoint, ReducedPoint
 from softgrasp.study.precision.result import Question, ReferenceSolution
 from softgrasp.study.precision.settings import Setting
-from softgrasp.study.reduce.measure import bases_of, chosen_methods, measured
-from softgrasp.study.reduce.result import Point
+from softgrasp.study.reduce.linear.measure import bases_of, chosen_methods, measured
+from softgrasp.study.reduce.linear.result import Point
 from softgrasp.study.shell.timing import repeated
 
 CALLS = 2_000  # single steps of a reduced model that are timed

@@ -31,7 +31,7 @@ from softgrasp.study.precision.reference import LADDER, make_reference
 from softgrasp.study.precision.result import Answer, ErrorBudget, Question, ReferenceSolution, WorkStudy
 from softgrasp.study.precision.riccati import ControlRuns, ask_reduced_riccati, ask_riccati, settings_of
 from softgrasp.study.precision.settings import own_setting, variant
-from softgrasp.study.reduce.measure import chosen_methods
+from softgrasp.study.reduce.linear.measure import chosen_methods
 from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Session
 

@@ -7,24 +7,22 @@ import difflib
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.motion import read_csv
+from softgrasp.fem.model.memory import size_text
+from softgrasp.fem.resources import free_memory
+from softgrasp.fem.run.motion import Profile, read_csv
 from softgrasp.fem.scene.text import out_of_range, read_text
 from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.reduction.certified.motion import Drive, Materials
+from softgrasp.reduction.certified.motion import FINER, Drive, Materials
 
 KEYS = ("lambda", "mu", "rho")
-FINER = 8  # steps for one, of the runs that tell the error of the step
 ROUNDING = 1e-9  # of the time of a move
-MOST = 1_000_000  # steps of a run, which stands in memory as a whole
+STEP_BYTES = 80  # of memory a step and mode while a run and the finer one are made: measured 60 to 70
 
 
 def parse_settings(settings: Sequence[str]) -> dict[str, float]:
@@ -92,55 +90,52 @@ def materials_of(model: CertifiedModel, setting: dict[str, float]) -> Materials:
     return model.materials(lam, mu, rho)
 
 
-def drive_of(model: CertifiedModel, motion: Path | None = None, dt: float | None = None) -> Drive:
-    """The motion that the model holds, or that of a CSV file, at any step.
+def drive_of(model: CertifiedModel, motion: Path | None = None, dt: float | None = None, runs: int = 1) -> Drive:
+    """The motion that the model holds, or that of a CSV file, at any step: the tables that a full run would have.
 
     Args:
         model: its drive says whether a file holds positions, joined by a cubic spline at rest at both ends, or forces,
             joined by straight lines.
         motion: time, then one column a degree of freedom of the hand; None takes the model's own.
         dt: step [s], adjusted so that steps fill the time of the motion; None takes the model's own.
+        runs: that are to be made with it.
 
-    Raises SceneError: the file does not fit, dt is not positive or too small, or the model holds no motion.
+    Raises SceneError: the file does not fit; dt is not positive, too long, or so short that the memory does not hold
+        the runs; or the model holds no motion, or one without its time law.
     """
     own = model.drive
     if dt is not None and not (math.isfinite(dt) and dt > 0):
         raise SceneError(f"--dt {dt:g}: the time step must be a positive number of seconds")
     if own is None:
         raise SceneError("the model holds no motion; reduce its scene again")
-    if motion is None and dt is None:
-        return own
-    times, columns, rates, end = _table(model, own, motion)
-    if dt is not None and dt > end * (1 + ROUNDING):
-        raise SceneError(f"--dt {dt:g}: the step is longer than the whole move of {end:g} s; give less")
-    if dt is not None and end > MOST * dt:
-        raise SceneError(f"--dt {dt:g}: a run of {end:g} s takes at most {MOST} steps; give {end / MOST:.3g} s or more")
-    steps = max(1, round(end / (dt or own.dt)))
-
-    def at(count: int) -> Drive:
-        step = end / count
-        if own.force is not None:
-            middles = step * (np.arange(count) + 0.5)
-            force = np.stack([np.interp(middles, times, column) for column in columns.T], axis=1)
-            return replace(own, dt=step, force=force, finer=None)
-        grid = step * np.arange(count + 1)
-        spline: Any = CubicSpline(times, columns, bc_type="clamped")
-        if rates is not None:
-            spline = CubicHermiteSpline(times, columns, rates)
-        return replace(own, dt=step, hand=(spline(grid), spline(grid, 1)), finer=None)
-
-    return replace(at(steps), finer=at(FINER * steps))
-
-
-def _table(model: CertifiedModel, own: Drive, motion: Path | None) -> tuple[Array, Array, Array | None, float]:
-    """Times, positions or forces, velocities where they are known, and the end [s]."""
+    profile, M_hand = own.profile, model.fine.parts["M_hand"]
     if motion is not None:
-        times, columns = read_csv(motion, len(model.fine.parts["M_hand"]), key="--motion")
-        return times, columns, None, float(times[-1])
-    finest = own.finer or own
-    end = finest.dt * finest.steps
-    if finest.force is not None:
-        return np.asarray(finest.dt * (np.arange(finest.steps) + 0.5), dtype=float), finest.force, None, end
-    assert finest.hand is not None
-    q, v = finest.hand
-    return np.asarray(finest.dt * np.arange(len(q)), dtype=float), q, v, end
+        table = read_csv(motion, len(M_hand), key="--motion")
+        kind: Literal["motion", "force"] = "motion" if own.force is None else "force"
+        profile = Profile(kind, float(table[0][-1]), np.zeros(len(M_hand)), 1.0, table)
+    if profile is None and dt is not None:
+        raise SceneError(
+            "--dt: the file of the model is of an earlier version and holds its motion at one step alone; "
+            "reduce its scene again, or give the motion with --motion"
+        )
+    step, end = own.dt if dt is None else dt, own.dt * own.steps if profile is None else profile.end
+    what = f"--dt {dt:g}" if dt is not None else "--batch" if motion is None else f"--motion {motion}"
+    if dt is not None and dt > end * (1 + ROUNDING):
+        raise SceneError(f"{what}: the step is longer than the whole move of {end:g} s; give less")
+    if profile is not None and dt is not None and round(end / dt) < profile.fewest:
+        raise SceneError(f"{what}: the step is too long for the move; give {end / profile.fewest:.3g} s or less")
+    _check_memory(model, end / step, runs, f"{what}: {'a run' if runs == 1 else f'{runs} runs'} of {end:g} s")
+    if profile is None or (motion is None and dt is None):
+        return own
+    return Drive.along(profile, max(1, round(end / step)), M_hand, own.start)
+
+
+def _check_memory(model: CertifiedModel, steps: float, runs: int, what: str) -> None:
+    """Refuse runs that the memory does not hold: one while it is made, all as they are kept."""
+    need = STEP_BYTES * (FINER * model.k + model.k2) + runs * 8 * (2 * model.coarse.N)
+    most = free_memory() / need
+    if steps > most:
+        raise SceneError(
+            f"{what} in {steps:.3g} steps would take about {size_text(steps * need)} of memory, and "
+            f"{size_text(most * need)} is free; take {most:.2g} steps or fewer, by a larger --dt"
+        )

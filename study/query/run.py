@@ -13,14 +13,17 @@ from mpi4py import MPI
 from rich.console import Console
 
 from softgrasp.fem.errors import SceneError, agree
+from softgrasp.fem.mesh.scene_hash import scene_keys
 from softgrasp.fem.model.build import Model, Stopwatch, build
 from softgrasp.fem.owned import follow
+from softgrasp.fem.petsc import on_root
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.fem.scene.file import load_scene_collective
+from softgrasp.fem.scene.file import load_scene, load_scene_collective, toml_value
 from softgrasp.reduction.certified.archive import load_certified
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.motion import Drive, Materials
+from softgrasp.reduction.origin import MATERIAL, UNKNOWN, differing, origin_of
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult, answer_rows
 from softgrasp.study.query.page import box_text, write_page
 from softgrasp.study.query.request import drive_of, materials_of, parse_settings, read_batch
@@ -81,7 +84,7 @@ def run_query(
         raise SceneError(f"{path} {what}; name the certified model that softgrasp reduce SCENE --tolerance wrote")
     model = load_certified(path)
     many = [materials_of(model, setting) for setting in questions]
-    drive = drive_of(model, motion, dt)
+    drive = drive_of(model, motion, dt, len(many))
     with agree(MPI.COMM_WORLD):
         if folder is not None and MPI.COMM_WORLD.rank == 0:
             read = [file for file in (path, motion, scene, batch) if file is not None]
@@ -102,7 +105,7 @@ def run_query(
         for m, run in zip(many, runs, strict=True)
     ]
     if fallback and any(answer.run is None for answer in each):
-        full = _full_model(model, path, scene, motion, drive)
+        full = _full_model(console, model, path, scene, motion, drive)
         each = [replace(a, run=_full_run(full, a.materials)) if a.run is None else a for a in each]
     answers = QueryResult(path, model, each, seconds, batch is not None)
     _show(console, answers)
@@ -149,16 +152,28 @@ def _show(console: Console, answers: QueryResult) -> None:
         show_warnings(console, [f"{lie} outside the box of the training; the bound holds all the same"])
 
 
-def _full_model(model: CertifiedModel, path: Path, scene: Path | None, motion: Path | None, drive: Drive) -> Model:
+def _full_model(
+    console: Console, model: CertifiedModel, path: Path, scene: Path | None, motion: Path | None, drive: Drive
+) -> Model:
     """The full model of the scene that a certified model was made from, under the motion of a query. Collective."""
     beside = (folder / "scene.toml" for folder in list(path.absolute().parents)[:2])
     scene = scene or next((file for file in beside if file.exists()), None)
     if scene is None:
         raise SceneError(f"--fallback full: no scene.toml beside {path}; name the scene of the model with --scene")
+    file = scene
+    keys = on_root(MPI.COMM_WORLD, lambda: origin_of(scene_keys(load_scene(file))))
+    if not model.fine.origin:
+        show_warnings(console, [f"{path} {UNKNOWN}"])
+    elif difference := differing(model.fine.origin, keys, (MATERIAL,)):
+        raise SceneError(
+            f"--fallback full: the certified model was built {difference} ({scene}); name the scene that it was "
+            "reduced from with --scene"
+        )
     overrides = [f"time.steps={drive.steps}", f"time.end={drive.dt * drive.steps!r}", "output.snapshots='none'"]
     if motion is not None:
         kind = "motion" if drive.force is None else "force"
-        overrides.append(f"motion={{profile='csv', csv='{motion.absolute()}', drive='{kind}'}}")
+        table = {"profile": "csv", "csv": str(motion.absolute()), "drive": kind}
+        overrides.append(f"motion={toml_value(table)}")
     full = build(load_scene_collective(MPI.COMM_WORLD, scene, overrides), comm=MPI.COMM_WORLD)
     load_certified(path, full.system.layout)  # refuses another mesh
     return full

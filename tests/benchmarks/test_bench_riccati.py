@@ -18,7 +18,7 @@ pytestmark = pytest.mark.serial
 
 
 def point(spec: dict[str, Any], ranks: int, method: str) -> dict[str, Any]:
-    return vars(SolverPoint(spec["nx"], ranks, method, spec["nx"] ** 2, 1.0, 100, 9e-11, 1e-8, solves=50))
+    return vars(SolverPoint(spec["nx"], ranks, method, spec["nx"] ** 2, 1.0, 100, 9e-11, 1e-8, 1e-5, solves=50))
 
 
 def fake(calls: list[dict[str, Any]], fail: tuple[int, ...] = ()) -> Any:

@@ -21,7 +21,7 @@ from softgrasp.reduction.replay import full_run
 from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.precision.full import find_places
-from softgrasp.study.reduce.measure import sweep
+from softgrasp.study.reduce.linear.measure import sweep
 
 CHANGES = ["tissue.cells=[2,2]", "time.steps=40", "time.end=4.0", "reduction.N=[6]", "output.frames=2"]
 

@@ -14,7 +14,7 @@ import softgrasp as sg
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.solve.modes import lowest_modes
-from softgrasp.reduction.archive import seal
+from softgrasp.reduction.archive import write_checksums
 from softgrasp.reduction.certified.archive import save_certified
 from softgrasp.reduction.certified.training import certified_model
 from softgrasp.reduction.model import ModelError, ReducedModel
@@ -129,7 +129,7 @@ def test_a_file_of_an_earlier_version_is_read_and_says_what_it_lacks(folder: Pat
         about = json.loads(file.attrs["model"])
         assert about.pop("origin")["contact.sides"] == ["left", "right"]
         file.attrs["model"] = json.dumps(about)
-        seal(file)
+        write_checksums(file)
     model, run = built(*[STRAIN] * (kind == "strain"))
     with pytest.warns(RuntimeWarning, match="does not hold what it was built from"):
         found = sg.replay(sg.load(path), model, run)

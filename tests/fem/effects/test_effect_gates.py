@@ -336,7 +336,7 @@ def test_multiple_modes_are_all_found(comm: MPI.Intracomm) -> None:
     M.assemble()
     nodes = np.arange(begin, end, dtype=float)[:, None]
     layout = SimpleNamespace(comm=comm, n_e=40, n_local=end - begin, dimension=1, nodes=nodes, reference=np.zeros(1))
-    system: Any = SimpleNamespace(layout=layout, K_ee=K, M_ee=M)
+    system: Any = SimpleNamespace(layout=layout, K_ee=K, M_ee=M, kept={})
     omega, Phi = lowest_modes(system, 4)
     np.testing.assert_allclose(omega, np.sqrt([1.0, 1.0, 1.0, 2.0]), rtol=1e-8)  # RESIDUAL of the check
     Phi = np.vstack(comm.allgather(Phi))

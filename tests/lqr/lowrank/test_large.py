@@ -23,6 +23,7 @@ from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.shifted import make_shifted, shifted_factor_bytes
 from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.reduced.riccati import tissue_gain_error
 from softgrasp.lqr.riccati import choose, solve
 from tests.helpers.models import make_scene
 from tests.helpers.riccati import CASES, NODE, gain, gain_error, oracle, paper, problem_of, x_error
@@ -49,6 +50,11 @@ def test_galerkin_gain_is_as_good_as_it_says(name: str) -> None:
     assert found.history[-1]["change"] <= 1e-6  # its own tolerance
     assert gain_error(problem, found, oracle(name)) < 1e-6  # the promise of the tolerance
     assert found.counts["solves"] <= 20
+    last, exact = found.history[-1], oracle(name).gain
+    # each part by its own norm: the change between two spaces says how far the later one is off
+    assert tissue_gain_error(problem, exact, found.gain) <= max(last["change_tissue"], 1e-8)  # 1e-8: the oracle's
+    hand = np.linalg.norm(found.gain.K_s - exact.K_s) / np.linalg.norm(exact.K_s)
+    assert hand <= max(last["change_hand"], 1e-8)
 
 
 @pytest.mark.parametrize(("beta", "weight"), [(0.02, 1.0), (0.002, 1.0), (0.002, 100.0), (0.002, 1e4), (2e-4, 1.0)])
@@ -269,5 +275,6 @@ def test_choice_names_its_reason() -> None:
     layers = make_problem(build(make_scene(*CASES["layers"], tissue={"cells": [6, 12]}), comm=MPI.COMM_WORLD))
     assert choose(layers).method == "radi"
     assert solve(small, "galerkin").reason == "asked for"
+    assert choose(small, "newton-adi").method == choose(small, "newton_adi").method == "newton_adi"  # as scenes say it
     with pytest.raises(SolverError, match="unknown"):
         solve(small, "magic")  # type: ignore[arg-type]

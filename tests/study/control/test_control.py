@@ -16,6 +16,7 @@ from mpi4py import MPI
 from rich.console import Console
 
 from softgrasp.fem.errors import SceneError, SoftgraspError
+from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.design.orders import BasisGains
@@ -113,7 +114,8 @@ def test_every_stable_gain_has_a_proved_bound(result: dict[str, Any]) -> None:
         # the excess of the loop without end, from an X with a residual of 1e-10 that the bound does not share
         assert p["cost_excess_at_most"] >= p["cost_excess"] * (1 - 1e-6) - 1e-12, p
         assert 0 <= p["cost_excess_proved"] <= p["cost_excess_at_most"], p
-        assert p["cost_excess_at_most"] <= 30 * p["cost_excess"] + 2e-12, p  # 24 measured where little is to come
+        # the run is made longer while the allowance is more than a tenth of the excess and 1e-6 of the cost
+        assert p["cost_excess_at_most"] <= 1.1 * p["cost_excess"] + 1.1e-6, p
 
 
 class _StopError(Exception):
@@ -313,6 +315,29 @@ def test_the_tolerance_holds_for_the_dense_method_too(tmp_path: Path) -> None:
     assert "allowed is 1.0e-15" in refused("paper_lqr", common(tmp_path) / "out", *few, "control.tolerance=1e-15")
     found = quietly(common(tmp_path) / "fine", *few, "control.tolerance=1e-11")
     assert found["residual"] <= 1e-11
+
+
+def test_a_scene_takes_both_spellings_of_newton_adi() -> None:
+    say = [load_scene(SCENES / "paper_lqr.toml", [f"control.method='newton{x}adi'"]) for x in "-_"]
+    assert say[0] == say[1]
+    assert scene_hash(say[0]) == scene_hash(say[1])
+
+
+def test_galerkin_states_its_true_residual_and_the_part_of_the_tissue(tmp_path: Path) -> None:
+    text = io.StringIO()
+    changes = [*SMALL[:1], "control.method='galerkin'", "control.N=[8]"]
+    out = common(tmp_path) / "out"
+    found = run_control(
+        SCENES / "paper_lqr.toml", out, changes, Console(file=text, width=200), quiet=True, gain_only=True
+    )
+    hand, tissue = found["gain_change"]["hand"], found["gain_change"]["tissue"]
+    assert found["residual"] > 1e-4  # a long way from the tolerance of a low-rank method, and said so
+    assert 0 < hand < 1e-2 * tissue < 1e-5
+    assert f"{found['residual']:.1e}" in text.getvalue()
+    assert f"rows of the hand {hand:.1e}, of the tissue {tissue:.1e}" in text.getvalue()
+    page = (out / "report.html").read_text()
+    assert f"{found['residual']:.1e}" in page
+    assert f"{tissue:.1e}" in page
 
 
 def test_galerkin_with_all_modes_is_exact(tmp_path: Path) -> None:

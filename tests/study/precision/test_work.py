@@ -29,8 +29,8 @@ from softgrasp.reduction.bases.engines import ENGINES
 from softgrasp.study.precision import full as wp_full
 from softgrasp.study.precision import plots as work_plots
 from softgrasp.study.precision import reduced as wp_reduced
+from softgrasp.study.precision import reference as wp_reference
 from softgrasp.study.precision import settings as wp_meshes
-from softgrasp.study.precision import truth as wp_truth
 from softgrasp.study.precision.answer import advice, parse_budget
 from softgrasp.study.precision.fit import interpolate, pareto, usable
 from softgrasp.study.precision.forward import step_counts, too_slow
@@ -78,8 +78,8 @@ def _few_samples() -> Iterator[None]:
         patch.setattr(wp_full, "BUILD_SECONDS", 0.0)
         patch.setitem(wp_meshes.POINT_WORK, 2, WORK)
         patch.setitem(wp_meshes.GOALS, 2, GOALS)
-        patch.setitem(wp_truth.FINEST, 2, FINEST)
-        patch.setitem(wp_truth.WORK, 2, 2 * WORK)
+        patch.setitem(wp_reference.FINEST, 2, FINEST)
+        patch.setitem(wp_reference.WORK, 2, 2 * WORK)
         patch.setattr(wp_reduced, "CALLS", 5)
         patch.setattr(work_plots, "save", rough_save)
         yield
@@ -468,7 +468,7 @@ def test_reference_counts_what_its_finest_mesh_leaves(fall: float) -> None:
     run |= {"n_e": 1, "states": 2, "dimension": 2, "steps": 1}
     runs = [wp_full.TimedRun(**run, values=exact + 1e-2 * fall**k * shape) for k in range(3)]
     settings = [Setting(None, 3, 32, refine=10.0**-k) for k in range(3)]
-    truth = wp_truth.combine(scene, dict(zip(settings, runs, strict=True)), settings[0], runs[0], runs[0])
+    truth = wp_reference.combine(scene, dict(zip(settings, runs, strict=True)), settings[0], runs[0], runs[0])
     left = 1e-2 * fall**2 * largest(shape, 2)[0] / largest(truth.series.values, 2)[0]
     assert truth.space[0] == pytest.approx(left, rel=1e-9)
     assert truth.time[0] == 0.0

@@ -17,8 +17,8 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision import forward as wp_forward
 from softgrasp.study.precision import full as wp_full
 from softgrasp.study.precision import reduced as wp_reduced
+from softgrasp.study.precision import reference as wp_reference
 from softgrasp.study.precision import settings as wp_meshes
-from softgrasp.study.precision import truth as wp_truth
 from softgrasp.study.precision.full import find_places, run_probed
 from softgrasp.study.precision.points import Request
 from softgrasp.study.precision.run import study_scene
@@ -71,7 +71,7 @@ def _few_samples() -> Iterator[None]:
         patch.setattr(wp_forward, "CG_TOLERANCES", ())
         for d, work, finest in ((2, 5e5, 1e-3), (3, 1e5, 1e-1)):
             patch.setitem(wp_meshes.POINT_WORK, d, work)  # no large run, whatever the times say
-            patch.setitem(wp_truth.FINEST, d, finest)
+            patch.setitem(wp_reference.FINEST, d, finest)
         patch.setitem(wp_meshes.GOALS, 3, {1: (), 2: (0.3, 0.1), 3: ()})
         patch.setattr(wp_forward, "SHARES", (2.0, 1.0, 0.5, 0.25))
         patch.setattr(wp_full, "BUILD_SECONDS", 0.0)

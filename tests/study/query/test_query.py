@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -20,7 +21,8 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene, resolved_toml
 from softgrasp.fem.solve.modes import lowest_modes
-from softgrasp.reduction.certified.archive import save_certified
+from softgrasp.reduction.archive import write_checksums
+from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.reduction.certified.model import Box, CertifiedModel
 from softgrasp.reduction.certified.training import certified_model
 from softgrasp.study.cli import app
@@ -274,17 +276,84 @@ def test_files_that_make_no_sense(file: Path, tmp_path: Path) -> None:
     alone.write_bytes(file.read_bytes())
     with pytest.raises(SceneError, match=r"no scene\.toml"):
         ask(alone, tolerance=1e-9, fallback="full")
-    with pytest.raises(SoftgraspError, match="belongs to a mesh of"):
+    with pytest.raises(SoftgraspError, match=r"tissue\.cells = \[4, 8\], and the scene has \[15, 30\]"):
         ask(file, tolerance=1e-9, fallback="full", scene=SCENES / "paper_forward.toml")
 
 
-def test_a_step_that_no_memory_holds_is_refused() -> None:
-    for dt in (1e-300, 1e-7):
-        with pytest.raises(SceneError, match=r"at most 1000000 steps; give 3e-06 s or more"):
+def test_a_step_that_no_memory_holds_is_refused(tmp_path: Path) -> None:
+    for dt in (1e-300, 1e-9):
+        with pytest.raises(SceneError, match=r"--dt .*: a run of 3 s .* GiB is free; take .* steps or fewer"):
             drive_of(made()[1], dt=dt)
+    long = tmp_path / "long.csv"
+    long.write_text("0,0,0\n1e8,1,1\n")
+    with pytest.raises(SceneError, match=r"--motion .*long\.csv: a run of 1e\+08 s .* by a larger --dt"):
+        drive_of(made()[1], long)
+    assert drive_of(made()[1], long, 1e6).steps == 100
+    with pytest.raises(SceneError, match=r"--batch: 1000000000 runs of 3 s"):
+        drive_of(made()[1], runs=1_000_000_000)
     with pytest.raises(SceneError, match=r"--dt 1e\+09: the step is longer than the whole move of 3 s"):
         drive_of(made()[1], dt=1e9)
-    assert drive_of(made()[1], dt=3.0).steps == 1
+    with pytest.raises(SceneError, match=r"--dt 3: the step is too long for the move; give 1\.5 s or less"):
+        drive_of(made()[1], dt=3.0)
+    assert drive_of(made()[1], dt=1.5).steps == 2
+
+
+@pytest.mark.parametrize("steps", [7, 40, 250])
+def test_another_step_moves_the_hand_as_a_full_run_of_that_step_does(file: Path, steps: int) -> None:
+    """Bit for bit, through the file; the error is that of the reduction alone."""
+    model, _ = made()
+    time = model.scene.time.model_copy(update={"steps": steps})
+    full = simulate(replace(model, scene=model.scene.model_copy(update={"time": time})))
+    drive = drive_of(load_certified(file), dt=3.0 / steps)
+    assert drive.hand is not None
+    assert drive.finer is not None
+    assert np.array_equal(drive.hand[0], full.q_s)
+    assert np.array_equal(drive.hand[1], full.v_s)
+    assert drive.finer.steps == 8 * steps
+
+
+def test_a_file_of_an_earlier_version_takes_no_other_step(file: Path, tmp_path: Path) -> None:
+    old = tmp_path / "old.h5"
+    old.write_bytes(file.read_bytes())
+    with h5py.File(old, "r+") as data:
+        del data["certificate/drive/profile"]
+        write_checksums(data)
+    status, _ = ask(old, "lambda=300", "mu=200")
+    assert status == 0
+    with pytest.raises(SceneError, match="earlier version and holds its motion at one step alone"):
+        ask(old, "lambda=300", "mu=200", dt=0.01)
+
+
+@pytest.mark.parametrize(
+    ("override", "key"),
+    [
+        ("effects.gravity={g=[0.0, -5.0]}", r"without effects\.gravity\.g, and the scene has \[0\.0, -5\.0\]"),
+        ("hand.mass=5.0", r"hand\.mass = 20\.0, and the scene has 5\.0"),
+        ("time.steps=50", r"time\.steps = 100, and the scene has 50"),
+        ("motion.target=[1.0, 3.0]", r"motion\.target"),
+        ("effects.reaction=true", r"effects\.reaction"),
+    ],
+)
+def test_the_full_model_of_another_scene_is_no_fallback(file: Path, tmp_path: Path, override: str, key: str) -> None:
+    other = tmp_path / "other.toml"
+    other.write_text(resolved_toml(load_scene(SCENES / "paper_forward.toml", [*KV, override])))
+    with pytest.raises(SceneError, match=f"--fallback full: the certified model was built .*{key}"):
+        ask(file, tolerance=1e-9, fallback="full", scene=other)
+    soft = tmp_path / "soft.toml"  # a query sets the materials itself
+    soft.write_text(
+        resolved_toml(
+            load_scene(SCENES / "paper_forward.toml", [*KV, "tissue.material={lambda=40.0, mu=40.0, rho=1.0}"])
+        )
+    )
+    assert ask(file, tolerance=1e-9, fallback="full", scene=soft)[0] == 0
+
+
+def test_quotes_in_the_name_of_a_motion(file: Path, tmp_path: Path) -> None:
+    path = tmp_path / 'it\'s "mine".csv'
+    path.write_text("0,0,0\n1,1,1\n")
+    status, text = ask(file, motion=path, dt=0.05, tolerance=1e-9, fallback="full")
+    assert status == 0
+    assert "full model, 20 steps" in text
 
 
 def test_the_command_line(file: Path) -> None:

@@ -24,11 +24,11 @@ from softgrasp.reduction.bases.states import BasisError, States
 from softgrasp.reduction.parameters import grid_of, outside, training_of, training_states
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, full_run, replay_linear
-from softgrasp.study.reduce.measure import FURTHER, box_models, measure_box, sweep
-from softgrasp.study.reduce.plots import instants
-from softgrasp.study.reduce.result import FullTimes
+from softgrasp.study.reduce.linear.measure import FURTHER, box_models, measure_box, sweep
+from softgrasp.study.reduce.linear.plots import instants
+from softgrasp.study.reduce.linear.views import gather_views
 from softgrasp.study.reduce.run import run_reduce
-from softgrasp.study.reduce.views import gather_views
+from softgrasp.study.reduce.times import FullTimes
 from tests.helpers.browser import find_chromium, look
 from tests.helpers.models import gather_matrix, gather_rows, gather_states, make_scene
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS
-from softgrasp.study.reduce.findings import findings
-from softgrasp.study.reduce.measure import FURTHER, chosen_methods
-from softgrasp.study.reduce.report import error_table, least_size, stability
-from softgrasp.study.reduce.result import MethodSweep, Point, best, kept_points, nearest
+from softgrasp.study.reduce.linear.findings import findings
+from softgrasp.study.reduce.linear.measure import FURTHER, chosen_methods
+from softgrasp.study.reduce.linear.report import error_table, least_size, stability
+from softgrasp.study.reduce.linear.result import MethodSweep, Point, best, kept_points, nearest
 from tests.helpers.models import make_scene
 
 PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"

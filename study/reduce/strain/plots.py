@@ -16,9 +16,7 @@ from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.reduction.strain.model import StrainModel
 from softgrasp.study.pictures import style
 from softgrasp.study.pictures.shapes import hand_polygons, seen, shadow
-from softgrasp.study.reduce.plots import FULL
-from softgrasp.study.reduce.result import StrainPoint
-from softgrasp.study.reduce.strain_measure import CELLS_AT, StrainStudy
+from softgrasp.study.reduce.strain.result import CELLS_AT, StrainPoint, StrainStudy
 
 
 def draw(out: Path, study: StrainStudy, picture: PictureMesh | None) -> list[Path]:
@@ -45,7 +43,7 @@ def figure_strain_errors(study: StrainStudy, out_png: Path) -> tuple[Path, ...]:
                     _pair(right, [p.cells for p in points], points, colour, f"N = {N}, {f.title}")
                     right.axhline(points[0].error_galerkin, ls=":", color=colour)
         for ax, label in ((left, "$N$"), (right, "sampled cells")):
-            ax.axhline(study.linear, **FULL)
+            ax.axhline(study.linear, **style.FULL)
             ax.set_xlabel(label)
             style.log_axis(ax, None)
             ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.2, labelspacing=0.25)

@@ -8,7 +8,7 @@ from itertools import groupby
 import numpy as np
 
 from softgrasp.reduction.bases.registry import PAPER_METHODS, PAPER_PLAIN
-from softgrasp.study.reduce.result import COMPARED, MethodSweep, Point
+from softgrasp.study.reduce.linear.result import COMPARED, MethodSweep, Point
 
 MEASURES = (
     ("error_deformation", "the deformation"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -12,9 +12,7 @@ from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, UNSTABLE, WIDTH, few_ticks, paper_style, save
-
-if TYPE_CHECKING:
-    from softgrasp.study.reduce.certify import BoxCheck, Size
+from softgrasp.study.reduce.certified.result import BoxCheck, Size
 
 KINDS = (
     ("bound", "bound (proved)", BLUE, "o"),

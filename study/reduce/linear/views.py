@@ -14,7 +14,7 @@ from softgrasp.reduction.bases.registry import PAPER_METHODS
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.parameters import thinned
 from softgrasp.reduction.replay import FullRun, replay_linear
-from softgrasp.study.reduce.result import MethodSweep, Point, by_error, nearest
+from softgrasp.study.reduce.linear.result import MethodSweep, Point, by_error, nearest
 
 MODES = 4  # a method
 FRAMES = 30

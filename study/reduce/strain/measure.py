@@ -4,25 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import qmc
 
-from softgrasp.fem.errors import SolverError
+from softgrasp.fem.errors import SceneError, SolverError, shortened
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.parameters import grid_of, mirrored, moved_to, outside, run_at, training_of
 from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.reduction.strain.model import StrainModel, TrainedBox
+from softgrasp.reduction.strain.model import StrainModel
 from softgrasp.reduction.strain.training import Reference, Training, pooled_errors, reference_of, replay_strain, train
-from softgrasp.study.reduce.measure import Say
-from softgrasp.study.reduce.result import FullTimes, StrainPoint
+from softgrasp.study.reduce.strain.result import CELLS_AT, HeldOutTest, StrainFamily, StrainPoint, StrainStudy
+from softgrasp.study.reduce.times import FullTimes, Say
 from softgrasp.study.shell.timing import median_seconds
 
 SIZES = (8, 10, 14, 18, 24, 30)  # N unless the scene names some: each more displacement costs cells too
-CELLS_AT = (14, 24)  # N at which tau is varied
 TAUS = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4)
 MOTIONS = 4  # held out
 SHARES = (0.9, 0.6)  # of the scene's own move, held out from models that are trained on it alone
@@ -35,53 +34,17 @@ HeldOut = tuple[str, FullRun]
 """A full run that trained no model, after what is new in it: "material" or "motion"."""
 
 
-@dataclass(frozen=True)
-class HeldOutTest:
-    """A full run that trained no model of its family."""
-
-    kind: str  # "material" or "motion", whichever is new
-    lam: float  # lam, mu: of the first layer [Pa]
-    mu: float
-    target: tuple[float, ...]  # where the hand ends [m]
-    errors: dict[int, float | None]  # in z by N; None where the model refuses the run or fails
-
-
-@dataclass(frozen=True)
-class StrainFamily:
-    """Models of all N from the same training runs."""
-
-    key: str  # "own", the scene's run alone, or "box", runs at other materials and motions too
-    box: TrainedBox  # what they answer for
-    runs: int  # full runs that trained them
-    points: tuple[StrainPoint, ...]  # with tau from the model on all cells, one for each N
-    curves: tuple[StrainPoint, ...]  # those, and others of some N with given tau
-    tests: tuple[HeldOutTest, ...]  # held-out runs
-    models: dict[int, StrainModel]  # those of ``points`` by N
-    refused: dict[int, str]  # reason by N
-
-    @property
-    def title(self) -> str:
-        """How its models were trained."""
-        return "trained on the scene's run" if self.key == "own" else "trained over the box"
-
-
-@dataclass(frozen=True)
-class StrainStudy:
-    """All that is measured."""
-
-    full: FullRun  # the scene's own full run
-    families: tuple[StrainFamily, ...]  # one or two
-    times: FullTimes  # of the full run
-    linear: float  # error in z of linear elasticity on the same scene
-    none: str  # why there are no runs at other materials; empty when there are
-
-
 def measure_strain(own: FullRun, times: FullTimes, say: Say) -> StrainStudy:
-    """Train, test and time. Collective. Raises SolverError: a run failed. ReductionError: there is no model."""
+    """Train, test and time. Collective. Raises SoftgraspError: a run failed, no N fits, or there is no model."""
     model = own.model
     options, hand = model.scene.reduction, 2 * model.system.layout.n_s
     chosen = options.N if "N" in options.model_fields_set else SIZES
     sizes = sorted({N for N in chosen if hand < N and N % 2 == 0})  # those that a model can have
+    if not sizes:
+        raise SceneError(
+            f"reduction.N = {shortened(str(list(chosen)))}: a model at finite strain has an even number of columns, "
+            f"more than the {hand} of the hand; give for example [{hand + 4}, {hand + 10}]"
+        )
     box_runs, held, none = _box_runs(own, say)
     first, near = model.system.materials[0], []
     for share in SHARES if _has_target(model) else ():

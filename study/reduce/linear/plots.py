@@ -20,8 +20,8 @@ from softgrasp.study.pictures import style
 from softgrasp.study.pictures.animation import film, timing, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, outline
 from softgrasp.study.pictures.shapes import hands_at
-from softgrasp.study.reduce.result import MethodSweep, Point, by_error, unbeaten
-from softgrasp.study.reduce.views import Views
+from softgrasp.study.reduce.linear.result import MethodSweep, Point, by_error, unbeaten
+from softgrasp.study.reduce.linear.views import Views
 
 TOP = 1.0  # errors above are drawn at the upper edge
 LOWEST = 1e-17  # of a singular value over the first
@@ -44,7 +44,6 @@ SPARE = ((BROWN, "-", ">"), (BROWN, "--", "h"), (BROWN, ":", "X"), (BROWN, "-.",
 CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 4.0, "mew": 0.8, "alpha": 0.6}
 OTHERS: dict[str, Any] = {"ls": "", "marker": ".", "ms": 4, "color": "#c4c4c4"}
 FRONT: dict[str, Any] = {"color": style.OUTLINE, "lw": 1.6, "zorder": 2}
-FULL: dict[str, Any] = {"color": "#888888", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}
 QUANTITIES = (
     ("error_deformation", "error of the deformation"),
     ("error", r"error of $[q_s, v_s, q_e, v_e]$"),
@@ -146,14 +145,14 @@ def figure_times(sweeps: Sequence[MethodSweep], full: float, out_png: Path) -> t
                 mark = {"ls": "", "marker": marker, "ms": 5.0, "color": colour, "mfc": fill}
                 ax.plot(t, e, **mark, zorder=3)
                 named[s.method.key] = Line2D([], [], label=s.method.short_title, **mark)
-            ax.axvline(full * unit, **FULL)
+            ax.axvline(full * unit, **style.FULL)
             ax.set(xscale="log", xlabel=xlabel, ylabel=QUANTITIES[0][1])
             style.log_axis(ax, 1.6 * TOP)
             style.few_ticks(ax.xaxis)
         rest = [
             Line2D([], [], label="other stable models", **OTHERS),
             Line2D([], [], label="Pareto front", **FRONT),
-            Line2D([], [], label="full run, prefactored", **FULL),
+            Line2D([], [], label="full run, prefactored", **style.FULL),
         ]
         figure.legend(handles=[*named.values(), *rest], loc="outside upper center", ncols=2)
         return style.save(figure, out_png)

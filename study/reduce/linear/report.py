@@ -2,33 +2,28 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import astuple, fields
 from pathlib import Path
 
-import numpy as np
-
 from softgrasp.reduction.bases.registry import Method
-from softgrasp.study.reduce.result import (
+from softgrasp.study.reduce.linear.result import (
     COMPARED,
     N_NOTE,
     BoxTests,
-    FullTimes,
     MethodSweep,
     Point,
     ReductionStudy,
-    StrainPoint,
     by_error,
     nearest,
     timed_points,
 )
+from softgrasp.study.reduce.tables import TIMES, short, time_cells
 from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
 
 LEVELS = (1e-1, 1e-2, 1e-3)  # of the error of the deformation, for which the least N is named
 LEVEL_NAMES = tuple(f"{level:.0e}".replace("e-0", "e-") for level in LEVELS)
-TIMES = ("run [ms]", "new [ms]", "offline [s]", "x again", "x new", "break-even")
 CAPTIONS = {
     "errors.png": "Error of the deformation of the paper's six methods against N, all columns of V counted. A curve "
     "is dotted where its model is unstable (crosses). Errors above 1 are drawn at 1.",
@@ -52,13 +47,6 @@ CAPTIONS = {
 def least_size(points: Sequence[Point], level: float) -> int | None:
     """Least N of a stable model whose error of the deformation is at most ``level``."""
     return min((p.N for p in points if p.stable and p.error_deformation <= level), default=None)
-
-
-def short(value: float | None, digits: int = 2) -> str:
-    """A number for a narrow column; what overflowed says so."""
-    if value is None:
-        return "-"
-    return f"{value:.{digits}g}" if np.isfinite(value) else "overflow"
 
 
 def title_of(method: Method, narrow: bool) -> str:
@@ -131,14 +119,6 @@ def summary(study: ReductionStudy) -> list[str]:
         f"It runs {speed.again:.3g} times as fast as the full model, and {speed.new:.3g} times at a new parameter.",
         f"{len(held)} of {len(study.sweeps)} methods are stable at every N that was tried.",
     ]
-
-
-def time_cells(p: Point | StrainPoint, full: FullTimes) -> tuple[str, ...]:
-    """Below :data:`TIMES`: seconds, and speed-ups with the runs until offline has paid."""
-    up = full.against(p)
-    runs = "never" if up.break_even_runs is None else str(math.ceil(up.break_even_runs))
-    seconds = f"{1e3 * p.time_online:.2f}", f"{1e3 * (p.time_setup + p.time_online):.2f}", f"{p.time_offline:.2f}"
-    return *seconds, short(up.again, 3), short(up.new, 3), runs
 
 
 def time_table(study: ReductionStudy, narrow: bool = False) -> Table:

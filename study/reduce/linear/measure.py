@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.run.simulate import RunOptions, simulate
-from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.control import Reduction
 from softgrasp.reduction.bases import registry
 from softgrasp.reduction.bases.basis import Basis
@@ -22,14 +20,13 @@ from softgrasp.reduction.model import ModelError, ReducedModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.reduce import project_scene
-from softgrasp.reduction.replay import FullRun, comparison_of, full_run, replay_inputs, replay_linear
-from softgrasp.study.reduce.result import (
+from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
+from softgrasp.study.reduce.linear.result import (
     COMPARED,
     LARGER,
     BoxErrors,
     BoxPoint,
     BoxTests,
-    FullTimes,
     MethodSweep,
     Point,
     TestedModel,
@@ -38,21 +35,17 @@ from softgrasp.study.reduce.result import (
     nearest,
     timed_points,
 )
+from softgrasp.study.reduce.times import FullTimes, Say
 from softgrasp.study.shell.timing import median_seconds
 
 FURTHER = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
 REPEATS, SETUPS = 15, 7  # behind each median of the online time and of the set-up
 METHODS_TESTED = 4  # over the box
-FULL_REPEATS = 3  # behind the median of the full run
-PATIENCE = 2.0  # seconds of a full run above which one is enough
 PAPER_FULL, PAPER_REDUCED = 16.22, 0.097  # seconds of [SBRH21]: 2n = 1916, 600 steps, and PSD at N = 14
 LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
 
 Progress = Callable[[int, int], None]
 """Called with what is done and what there is."""
-
-Say = Callable[[str, int, int], None]
-"""Called with what is done, its number and how many there are."""
 
 
 def chosen_methods(options: Reduction) -> tuple[str, ...]:
@@ -156,6 +149,17 @@ def sweep(name: str, full: FullRun, options: Reduction, progress: Progress = lam
     return MethodSweep(registry.METHODS[name], tuple(points), models, sigma, *about)
 
 
+def sweep_all(names: Sequence[str], full: FullRun, say: Say) -> tuple[MethodSweep, ...]:
+    """Every method at all N of the scene. Collective."""
+    options = full.model.scene.reduction
+    size = len(options.N)
+
+    def swept(i: int, done: int, of: int) -> None:
+        say(names[i], size * i + size * done // of, size * len(names))
+
+    return tuple(sweep(name, full, options, partial(swept, i)) for i, name in enumerate(names))
+
+
 def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | None) -> list[TestedModel]:
     """Models of the best methods at two N: those of the sweep, and from ``states`` with the same N. Collective."""
     outputs, models = full.model.outputs, []
@@ -205,22 +209,6 @@ def measure_box(full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress
         largest = max(errors, key=lambda e: (not np.isfinite(e), e))
         summary.append(BoxErrors(m.method.key, m.model.N, runs, own[i], statistics.median(errors), largest))
     return BoxTests(tuple(models), tuple(points), tuple(summary), trained_at if training else (), box_of(scene))
-
-
-def measured_run(model: Model, say: Say) -> tuple[FullRun, FullTimes]:
-    """The full run, and its seconds in the median of several when it is short. Collective."""
-    comm = model.system.layout.comm
-    first = simulate(model, RunOptions(progress=lambda run: say("full run", run.reached, run.steps)))
-    repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
-    runs = [first] + [simulate(replace(model, watch=Stopwatch(comm))) for _ in range(repeats - 1)]
-    factor = statistics.median(run.seconds["factor"] for run in runs)
-    return full_run(model, first), FullTimes(statistics.median(map(steps_seconds, runs)), factor)
-
-
-def steps_seconds(run: Trajectory) -> float:
-    """Seconds of all steps; the first is not among those measured, since it sets up the solver."""
-    n = len(run.times) - 1
-    return run.seconds["steps"] / max(n - 1, 1) * n
 
 
 def speed_notes(n_e: int, steps: int, full: FullTimes, sweeps: Sequence[MethodSweep]) -> tuple[str, ...]:

@@ -1,0 +1,1 @@
+"""One reduced model that knows its error."""

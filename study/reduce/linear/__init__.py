@@ -1,0 +1,1 @@
+"""Linear reduced models: every basis at every N."""

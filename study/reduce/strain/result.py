@@ -1,0 +1,80 @@
+"""What ``softgrasp reduce`` finds at finite strain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from softgrasp.reduction.replay import FullRun
+from softgrasp.reduction.strain.model import StrainModel, TrainedBox
+from softgrasp.study.reduce.times import FullTimes
+
+CELLS_AT = (14, 24)  # N at which tau is varied
+
+
+@dataclass(frozen=True)
+class StrainPoint:
+    """One model at finite strain; errors are relative and in z unless they say otherwise, times in seconds."""
+
+    N: int  # N, k: dimension with the hand's 2 n_s, and displacements
+    k: int
+    tau: float  # tau, residual: of the weights, asked for and reached
+    residual: float
+    cells: int  # that carry a weight
+    # error_own, error_own_velocity, error_own_energy_norm: on the scene's own run, which trained the model: of z, of v
+    # in M_ee, of (z, v) in (z'K_ee z + v'M_ee v)^(1/2)
+    error_own: float
+    error_own_velocity: float
+    error_own_energy_norm: float
+    error_training: float  # over all training runs
+    error_galerkin: float  # the same of the model on all cells
+    floor: float  # of the basis, on the scene's own run
+    error_materials: float | None  # error_materials, error_motions: largest on held-out runs; None without any
+    error_motions: float | None
+    # largest change of the model's own energy that neither load nor damping explains, over all training runs
+    drift: float
+    evaluations: float  # of the force in a step
+    engine: str  # of the stepper, "C" or "NumPy"
+    time_offline: float  # basis, model on all cells, forces and weights, after the full runs
+    time_setup: float  # time_setup, time_online: a new parameter before its run, and a run
+    time_online: float
+
+
+@dataclass(frozen=True)
+class HeldOutTest:
+    """A full run that trained no model of its family."""
+
+    kind: str  # "material" or "motion", whichever is new
+    lam: float  # lam, mu: of the first layer [Pa]
+    mu: float
+    target: tuple[float, ...]  # where the hand ends [m]
+    errors: dict[int, float | None]  # in z by N; None where the model refuses the run or fails
+
+
+@dataclass(frozen=True)
+class StrainFamily:
+    """Models of all N from the same training runs."""
+
+    key: str  # "own", the scene's run alone, or "box", runs at other materials and motions too
+    box: TrainedBox  # what they answer for
+    runs: int  # full runs that trained them
+    points: tuple[StrainPoint, ...]  # with tau from the model on all cells, one for each N
+    curves: tuple[StrainPoint, ...]  # those, and others of some N with given tau
+    tests: tuple[HeldOutTest, ...]  # held-out runs
+    models: dict[int, StrainModel]  # those of ``points`` by N
+    refused: dict[int, str]  # reason by N
+
+    @property
+    def title(self) -> str:
+        """How its models were trained."""
+        return "trained on the scene's run" if self.key == "own" else "trained over the box"
+
+
+@dataclass(frozen=True)
+class StrainStudy:
+    """All that is measured."""
+
+    full: FullRun  # the scene's own full run
+    families: tuple[StrainFamily, ...]  # one or two
+    times: FullTimes  # of the full run
+    linear: float  # error in z of linear elasticity on the same scene
+    none: str  # why there are no runs at other materials; empty when there are

@@ -1,0 +1,80 @@
+"""``softgrasp reduce`` on a scene with effects.finite_strain: run, tables, sentences, page."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields
+from typing import Any
+
+from softgrasp.fem.errors import SceneError
+from softgrasp.fem.model.build import Stopwatch
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.reduction.archive import save
+from softgrasp.study.reduce.result import reduce_result
+from softgrasp.study.reduce.strain.measure import measure_strain
+from softgrasp.study.reduce.strain.report import cell_table, error_table, sections, sentences, summary, time_table
+from softgrasp.study.reduce.strain.result import StrainFamily, StrainPoint, StrainStudy
+from softgrasp.study.reduce.times import measured_run
+from softgrasp.study.report.tables import Table
+from softgrasp.study.shell.session import Page, Session, list_files
+
+
+def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
+    """Reduce the scene and write the results. Collective. Raises SoftgraspError: with one sentence."""
+    if scene.reduction.methods:
+        raise SceneError(
+            "reduction.methods names linear bases; leave it out with effects.finite_strain, whose models have one basis"
+        )
+    model, watch = session.model(scene), Stopwatch(session.comm)
+    with session.counting("full run") as say:
+        with watch.stage("full"):
+            full, times = measured_run(model, say)
+        with watch.stage("reduced"):
+            study = measure_strain(full, times, say)
+    folder = session.out / "models"
+    models = {folder / f"{f.key}_N{N}.h5": rom for f in study.families for N, rom in f.models.items()}
+    for path, rom in models.items():
+        save(rom, path)
+    picture = None
+    if session.pictures:
+        from softgrasp.fem.fields.picture import gather_picture
+        from softgrasp.study.reduce.strain.plots import draw  # brings Matplotlib
+
+        picture = gather_picture(model)
+    lines = sentences(study)
+    result = reduce_result(
+        study.full,
+        {
+            "finite_strain": {f.key: _family(study, f) for f in study.families},
+            "error_linear": study.linear,
+            "reason_for_none": study.none,
+            "findings": lines,
+        },
+        study.times.to_json() | watch.seconds,
+    )
+
+    def page() -> Page:
+        files = draw(session.out, study, picture) if session.pictures else []
+        title = f"{scene.name}: reduced models at finite strain, {study.families[-1].points[0].engine} stepper"
+        names = (field.name for field in fields(StrainPoint))
+        rows = [(f.runs, *asdict(p).values()) for f in study.families for p in f.curves]
+        points = {"points.csv": Table(("runs", *names), rows)}
+        return Page(title, summary(study), sections(study, files), points, [*files, *models])
+
+    for table in (error_table(study), time_table(study), cell_table(study)):
+        session.console.print(table.terminal(wrap=(0,), width=session.console.width))
+    for sentence in lines:
+        session.console.print(sentence, markup=False)
+    list_files(session.console, session.write(scene, result, page))
+    return result
+
+
+def _family(study: StrainStudy, f: StrainFamily) -> dict[str, Any]:
+    """One entry of "finite_strain" in ``result.json``."""
+    return {
+        "runs": f.runs,
+        "box": f.box,
+        "points": [asdict(p) | {"speed_up": study.times.against(p)} for p in f.points],
+        "cells": f.curves,
+        "held_out": f.tests,
+        "refused": f.refused,
+    }
