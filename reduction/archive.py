@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from softgrasp.reduction.strain.model import StrainModel
 
 LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 2"
+# what h5py and the reading of a model raise of a file that is not whole
+DAMAGE = (OSError, LookupError, TypeError, ValueError, RuntimeError, AttributeError, MemoryError)
 CHECKSUMS = ("sha256", "sha256_lift")  # attributes: of everything but the reconstruction, and of the reconstruction
 ROWS = 1 << 16  # rows of the reconstruction read at a time: 30 MB for 60 columns
 # what a file says of a model in JSON, beside its materials and the names of its outputs
@@ -208,7 +210,7 @@ def reading(
                     other = about["scene_hash"][:12]
                     raise ModelError(f"{path} was made for another scene (hash {other}); reduce the scene again")
                 yield file, about
-        except (OSError, KeyError, TypeError, ValueError) as error:
+        except DAMAGE as error:
             reason = f"{error} is missing" if isinstance(error, KeyError) else error
             raise ModelError(f"{path} cannot be read as a reduced model ({reason}); reduce the scene again") from error
 

@@ -145,9 +145,10 @@ def _trajectory(file: Path) -> tuple[list[str], np.ndarray]:
             header, *cells = csv.reader(lines)
         rows = np.array(cells, dtype=float)
         good = header[:1] == ["t [s]"] and rows.shape == (len(cells), len(header)) and len(rows) > 0
-        known = np.abs(rows) < LARGEST
-        known[:1, [name.startswith("force") for name in header]] = True  # a force is of the step that ends there
-        good = good and bool(known.all() and (np.diff(rows[:, 0]) > 0).all())
+        if good:
+            known = np.abs(rows) < LARGEST
+            known[0, [name.startswith("force") for name in header]] = True  # a force is of the step that ends there
+            good = bool(known.all() and (np.diff(rows[:, 0]) > 0).all())
     except OSError as error:
         raise SceneError(f"{file} cannot be read ({error.strerror}); run the scene again") from None
     except (ValueError, csv.Error):

@@ -181,7 +181,7 @@ def run_sweep_points(
     """
     points = sweep.points()
     scenes = [sweep.scene(values) for values in points]
-    keys = [f"{scene_hash(scene)}-{sweep.N}-{package_version()}" for scene in scenes]
+    keys = _keys(sweep, scenes)
     done: dict[str, SweepPoint] = comm.bcast(
         _read(out, dict(zip(keys, points, strict=True))) if comm.rank == 0 else None
     )
@@ -212,6 +212,16 @@ def run_sweep_points(
         done |= part
     group.Free()
     return [done[key] for key in keys]
+
+
+def _keys(sweep: Sweep, scenes: Sequence[Scene]) -> list[str]:
+    return [f"{scene_hash(scene)}-{sweep.N}-{package_version()}" for scene in scenes]
+
+
+def read_points(sweep: Sweep, out: Path) -> dict[str, SweepPoint]:
+    """The points of a sweep that earlier calls have left in a folder. Not collective."""
+    points = sweep.points()
+    return _read(out, dict(zip(_keys(sweep, [sweep.scene(values) for values in points]), points, strict=True)))
 
 
 def _sealed(key: str, numbers: dict[str, float | None]) -> dict[str, Any]:

@@ -124,7 +124,7 @@ def test_two_runs_are_listed_and_compared(tmp_path: Path) -> None:
     assert numbers["output_final[0]"][:2] == tuple(r["output_final"][0] for r in results)
     assert "n_e" not in numbers
     assert not compare(tmp_path / "a", tmp_path / "a").numbers.rows
-    assert apart(compare(tmp_path / "a", tmp_path / "a").traces) == "The trajectories differ by at most 0 m."
+    assert apart(compare(tmp_path / "a", tmp_path / "a").traces) == "The trajectories differ by at most 0 m and 0 N."
     assert apart((["t [s]", "x [m]", "turn [rad]"], np.eye(3), np.diag([1.0, 3.0, -1.0]))) == (
         "The trajectories differ by at most 2 m and 2 rad."
     )
