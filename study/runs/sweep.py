@@ -52,7 +52,9 @@ def parse_axis(text: str) -> SweepAxis:
         else:
             first, last, count = float(parts[0]), float(parts[1]), int(parts[2])
             if count > MOST:
-                raise SceneError(f"'{shortened(text)}' has {count} values; a sweep has at most {MOST} points")
+                raise SceneError(
+                    f"'{shortened(text)}' has {shortened(str(count))} values; a sweep has at most {MOST} points"
+                )
             with np.errstate(all="ignore"):
                 values = [float(x) for x in (np.geomspace if log else np.linspace)(first, last, count)]
         good = bool(key) and len(parts) - log in (1, 3) and bool(np.isfinite(values).all()) and len(values) > 0

@@ -121,7 +121,9 @@ def _family(
         except ReductionError as error:
             refused[N] = error.reason
     if training is None:
-        raise ReductionError(f"no N of {list(sizes)} fits: {'; '.join(refused.values())}")
+        raise ReductionError(
+            f"the runs give no model at finite strain with {' or '.join(map(str, sizes))} columns: {'; '.join(refused.values())}"
+        )
     references = [reference_of(full, training.Phi) for _, full in held]
     fitting = [N for N in sizes if N not in refused]
     points, curves, models, missed = [], [], {}, {}

@@ -151,9 +151,9 @@ def kinds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Kind]:
         body = folder(f"mesh-{suffix}") / f"body.{suffix}"
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            strip.write(body)
+            strip.write(body, "gmsh" if suffix == "msh" else None)
         made[f"mesh .{suffix}"] = Kind(
-            body, lambda at, name=body.name: load_arrays(at / name, 1.0, repair=False), body.parent, False
+            body, lambda at, name=body.name: load_arrays(at / name, 1.0, repair=False, limit=2.0), body.parent, False
         )
     add_runs(made, folder)
     add_models(made, folder)
