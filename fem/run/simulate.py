@@ -230,7 +230,7 @@ class Run(Stepped):
         for vector in (self.state.z, self.state.v, midpoint.r):
             vector.stateIncrease()
         midpoint.join(self.state)
-        midpoint.recall(saved.newton_rows, saved.newton_numbers)
+        midpoint.recall(saved.solver_rows, saved.solver_numbers)
 
     def trajectory(self) -> Trajectory:
         """Gather the small results; the tissue stays distributed. Collective."""

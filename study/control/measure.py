@@ -26,6 +26,7 @@ from softgrasp.lqr.design.orders import (
     BasisGains,
     Notify,
     best_gains,
+    certified,
     course_of,
     fast_order,
     reduce_gains,
@@ -188,7 +189,8 @@ def retune(
     The duality gaps of all gains of one setting come from the same few runs of ``plan``.
     """
     layout = design.problem.layout
-    reason, chosen = outside(design.model), re_tunable(bases, layout.n_s)
+    reason = outside(design.model)
+    chosen = [] if reason else re_tunable(certified(design, bases, range(fast_order(layout.n_s) + 1)), layout.n_s)
     if not reason and layout.states > BOX_STATES:
         reason = (
             f"{layout.states} states are more than {BOX_STATES}: the full solutions to compare with would take long"

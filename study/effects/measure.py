@@ -25,6 +25,7 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.solvers import ITERATIVE
 from softgrasp.study.effects.result import Cost, OffProof
 from softgrasp.study.effects.switch import neutral
 from softgrasp.study.shell.timing import RepeatableRun, interleave, medians, rotated
@@ -123,7 +124,7 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
     factored = solver.ksp.getOperators()[0]
     if factored.handle != solver.S.handle:
         sizes["S, factored"] = everywhere(matrix_memory(factored), factored)
-    if solver.name != "cg" and solver.S.comm.size == 1:  # factors spread over ranks are out of reach
+    if solver.name not in ITERATIVE and solver.S.comm.size == 1:  # factors spread over ranks are out of reach
         sizes["factor"] = everywhere(matrix_memory(solver.ksp.getPC().getFactorMatrix()), solver.S)
     return {name: size for name, size in sizes.items() if size > 0}
 

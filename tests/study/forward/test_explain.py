@@ -225,10 +225,11 @@ def test_typical_gradient_leaves_out_a_hundredth_of_the_body(comm: MPI.Intracomm
 
 def test_digits_that_are_left() -> None:
     assert inexact(1e-12, 1e-14, "cholesky", 0.3) == []
-    assert inexact(1e-5, 1e-14, "cg", 0.3) == []  # of cg the residual counts
+    assert inexact(1e-12, 1e-4, "cg", 0.3) == []  # the tolerance of a step
+    assert "5 digits" in inexact(1e-5, 1e-4, "stars", 0.3)[0]  # energy is exact at any tolerance
     assert "about 5 digits, because nu = 0.5 - 2.0e-11" in inexact(5.7e-6, 1e-14, "cholesky", 0.5 - 2e-11)[0]
     assert "badly conditioned" in inexact(1e-12, 1e-7, "mumps", 0.3)[0]
-    assert "time.rtol" in inexact(1e-5, 1e-7, "cg", 0.3)[0]
+    assert "time.rtol" in inexact(1e-12, 1e-2, "cg", 0.3)[0]
 
 
 @pytest.mark.serial
