@@ -277,17 +277,25 @@ def query(
 
 
 @app.command()
-@takes("scene out set_ quiet pictures gain_only empty pdf")
+@takes("scene out set_ quiet pictures gain_only retune empty pdf")
 def control(
     gain_only: Annotated[
         bool, typer.Option("--gain-only", help="only the Riccati equation and the controllers: no loop, no pictures")
+    ] = False,
+    retune: Annotated[
+        bool,
+        typer.Option(
+            "--retune",
+            help="also re-tune gains at nine materials over reduction.lambda_range and mu_range, each against a full "
+            "Riccati equation of its own: many times the work",
+        ),
     ] = False,
     **shared: Any,
 ) -> None:
     """Design the optimal feedback of a scene, reduce it and close the loop; also under `mpiexec -n N`."""
     from softgrasp.study.control.run import run_control
 
-    _run(run_control, gain_only=gain_only, **shared)
+    _run(run_control, gain_only=gain_only, retune=retune, **shared)
 
 
 @app.command()
@@ -303,7 +311,7 @@ def study(
     question: Annotated[
         list[str] | None,
         typer.Option(
-            help="only this question: forward, reduced, bases, riccati, reduced_riccati or loop; several with commas"
+            help="only this question: forward, reduced, bases, riccati or reduced_riccati; several with commas"
         ),
     ] = None,
     **shared: Any,

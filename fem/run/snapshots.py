@@ -79,15 +79,18 @@ class NoStore:
 
 
 class MemoryStore(NoStore):
-    """Every k-th state is a column of one local array; the step writes straight into it.
+    """Every k-th state, or ``few`` of these, is a column of one local array; the step writes straight into it.
 
     Raises ResourceError: the columns of all ranks would not fit in the memory that is free now.
     """
 
-    def __init__(self, system: BlockSystem, steps: int, every: int) -> None:
+    def __init__(self, system: BlockSystem, steps: int, every: int, few: int | None = None) -> None:
         super().__init__(system)
         layout = system.layout
-        count = steps // every + 1
+        self.steps = np.arange(0, steps + 1, every)
+        if few is not None:
+            self.steps = self.steps[spread(len(self.steps), few)]
+        count = len(self.steps)
         needed = 16 * layout.n_e * count
         free = layout.comm.bcast(free_memory())
         if needed > 0.8 * free:
@@ -96,7 +99,6 @@ class MemoryStore(NoStore):
                 f"and {free} are free; set output.every = {every * int(np.ceil(needed / (0.5 * free)))} "
                 "or output.snapshots = 'hdf5'"
             )
-        self.steps = np.arange(0, steps + 1, every)
         self.Z = np.empty((2 * layout.n_local, len(self.steps)), order="F")
         self.Z.fill(0.0)  # touches every page here, not in the time loop
         self.columns = {int(s): state_on(self.Z[:, j], system) for j, s in enumerate(self.steps)}
@@ -110,7 +112,12 @@ class MemoryStore(NoStore):
         return self.Z[:, : int(np.searchsorted(self.steps, step, side="right"))]
 
     def restore(self, columns: Array, step: int, run: str) -> None:
-        """Fill the first columns again."""
+        """Fill the first columns again. Raises CheckpointError: the run before kept others."""
+        if columns.shape[1] != np.searchsorted(self.steps, step, side="right"):
+            raise CheckpointError(
+                f"the restart file holds {columns.shape[1]} states up to step {step}, this run keeps others; resume "
+                "with the command that was stopped, or run again without --resume"
+            )
         self.Z[:, : columns.shape[1]] = columns
 
     def finish(self, times: Array, q: Array, v: Array) -> Snapshots | None:
@@ -268,10 +275,20 @@ def _reserve(path: Path, size: int) -> None:
         os.posix_fallocate(file.fileno(), file.seek(0, os.SEEK_END), size)
 
 
-def make_store(system: BlockSystem, kind: str, steps: int, every: int, directory: Path, run: str | None) -> NoStore:
-    """Store of a run: memory, hdf5 or none; ``run`` is the name of a new run, None resumes. Collective."""
-    if kind == "memory":
-        return MemoryStore(system, steps, every)
+def spread(count: int, few: int) -> np.ndarray:
+    """Numbers of at most ``few`` of so many columns, equally spaced, first and last included."""
+    return np.unique(np.linspace(0, count - 1, few).round().astype(int))
+
+
+def make_store(
+    system: BlockSystem, kind: str, steps: int, every: int, directory: Path, run: str | None, few: int | None = None
+) -> NoStore:
+    """Store of a run: memory, hdf5 or none; ``run`` is the name of a new run, None resumes. Collective.
+
+    ``few``: states that "auto" keeps; None keeps all.
+    """
+    if kind in ("auto", "memory"):
+        return MemoryStore(system, steps, every, few if kind == "auto" else None)
     if kind == "hdf5":
         return Hdf5Store(system, steps, every, directory, run)
     return NoStore(system)
