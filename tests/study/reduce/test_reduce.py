@@ -331,7 +331,7 @@ def test_without_pictures(mpi_tmp_path: Path) -> None:
     reduced(mpi_tmp_path, "reduction.methods=['craig_bampton']", "reduction.N=[6]", pictures=False)
     MPI.COMM_WORLD.Barrier()
     assert {p.name for p in mpi_tmp_path.iterdir()} == {
-        "result.json", "points.csv", "scene.toml", "report.html", "models",
+        "result.json", "points.csv", "scene.toml", "report.html", "models", "softgrasp.files",
     }  # fmt: skip
 
 
