@@ -30,7 +30,7 @@ FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}  # 1: systems without a mesh
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}  # above, the factor itself does not fit
 # Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. On two ranks a spread one
 # takes 0.68 and 0.65 of the time for solve and set-up at 2e4 unknowns in 3D; a whole one on each 1.4 and 1.2, and the
-# memory of one for each, the price of the same bits in every run. In 2D blocks on every rank beat any spread factor to 2e5.
+# memory of one for each, the price of the same bits. In 2D blocks on every rank beat any spread factor to 2e5.
 REPEATED_LIMIT = {1: 1_000_000, 2: 1_000_000, 3: 40_000}
 REPEATED_RANKS = 4
 # Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,
