@@ -82,8 +82,8 @@ class ClosedLoop:
     Args:
         problem: plant, outputs and weights.
         dt: time step [s].
-        solver: cholesky, mumps, cg or auto.
-        rtol: tolerance of cg.
+        solver: cholesky, mumps, cg, stars or auto.
+        rtol: tolerance of cg and stars.
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 
     Raises:
@@ -102,13 +102,13 @@ class ClosedLoop:
         problem: RiccatiProblem,
         dt: float,
         solver: str = "auto",
-        rtol: float = 1e-10,
+        rtol: float = 1e-4,
         reproducible: Reproducible = "auto",
     ) -> None:
         if not (np.isfinite(dt) and dt > 0):
             raise ControlError(f"dt = {dt} s must be a positive number")
         self.problem, self.dt = problem, dt
-        name, reason = choose_solver(problem.layout, solver)
+        name, reason = choose_solver(problem.layout, solver, contrast=problem.system.contrast)
         begin = time.perf_counter()
         self.midpoint = make_midpoint(problem.system, dt, name, rtol, reproducible)
         self.solver = self.midpoint.solver.used(reason)

@@ -15,7 +15,8 @@ from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 DENSE_LIMIT = 1300  # up to here all modes can be kept when asked for: order 2600, for those who wait
-LOWEST_MODES = 150  # kept by default: Schur forms of order 300, tenths of a second each
+FEW = 150  # modes up to which a plant keeps them all: its spectrum is exact, a tenth of a second a gain
+LOWEST_MODES = 60  # of a larger one: a hundredth
 
 
 @dataclass(frozen=True)
@@ -58,12 +59,15 @@ class ModalLoop:
     :func:`softgrasp.lqr.spectrum.certificate.abscissa` for large scenes.
 
     Args:
-        modes: how many; all where the plant has no more of them, up to :data:`DENSE_LIMIT`.
+        modes: how many; all where the plant has no more of them, up to :data:`DENSE_LIMIT`. None keeps all up to
+            :data:`FEW`, or :data:`LOWEST_MODES`.
     """
 
-    def __init__(self, problem: RiccatiProblem, modes: int = LOWEST_MODES) -> None:
+    def __init__(self, problem: RiccatiProblem, modes: int | None = None) -> None:
         self.problem, self.comm = problem, problem.layout.comm
         n_e = problem.layout.n_e
+        if modes is None:
+            modes = FEW if n_e <= FEW else LOWEST_MODES
         self.complete = n_e <= min(modes, DENSE_LIMIT)
         self.plant = _all(problem) if self.complete else lowest_plant(problem, min(modes, n_e))
         space = self.plant.space

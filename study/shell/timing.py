@@ -43,20 +43,36 @@ def median_seconds(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int) -
     return statistics.median(repeated(comm, call, repeats))
 
 
+def processor_seconds(comm: MPI.Intracomm, call: Callable[[], Any]) -> float:
+    """Processor time of a call on the rank that takes most; other programs hardly change it. Collective."""
+    comm.Barrier()
+    begin = time.process_time()
+    call()
+    return float(comm.allreduce(time.process_time() - begin, MPI.MAX))
+
+
+def median_processor_seconds(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int) -> float:
+    """Median of :func:`processor_seconds`. Collective."""
+    return statistics.median(processor_seconds(comm, call) for _ in range(repeats))
+
+
 def warm(count: int) -> int:
     """Steps before the timed ones: the method before left the caches full of its own factor."""
     return max(1, count // 20)
 
 
-def interleave(methods: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
+def interleave(
+    methods: Mapping[str, Callable[[], float]], repeats: int, most: Mapping[str, int] | None = None
+) -> dict[str, list[float]]:
     """Call every method once a repeat, in rotated order, so that noise hits all alike; what each returned.
 
-    Collective if the methods are.
+    Collective if the methods are. ``most``: calls of each after which it is left out; None leaves out none.
     """
     samples: dict[str, list[float]] = {name: [] for name in methods}
     for i in range(repeats):
         for name in rotated(methods, i):
-            samples[name].append(methods[name]())
+            if most is None or i < most[name]:
+                samples[name].append(methods[name]())
     return samples
 
 

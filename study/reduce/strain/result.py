@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from softgrasp.reduction.replay import FullRun
 from softgrasp.reduction.strain.model import StrainModel, TrainedBox
-from softgrasp.study.reduce.times import FullTimes
+from softgrasp.study.reduce.times import FullTimes, Turns
 
 CELLS_AT = (14, 24)  # N at which tau is varied
 
@@ -25,6 +26,7 @@ class StrainPoint:
     error_own: float
     error_own_velocity: float
     error_own_energy_norm: float
+    estimate_own: float  # what the model itself estimates of ``error_own``
     error_training: float  # over all training runs
     error_galerkin: float  # the same of the model on all cells
     floor: float  # of the basis, on the scene's own run
@@ -37,6 +39,7 @@ class StrainPoint:
     time_offline: float  # basis, model on all cells, forces and weights, after the full runs
     time_setup: float  # time_setup, time_online: a new parameter before its run, and a run
     time_online: float
+    time_estimate: float  # of the error of a run, after it
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,7 @@ class HeldOutTest:
     mu: float
     target: tuple[float, ...]  # where the hand ends [m]
     errors: dict[int, float | None]  # in z by N; None where the model refuses the run or fails
+    estimates: dict[int, float | None]  # of them by N, made by the model without the full run
 
 
 @dataclass(frozen=True)
@@ -76,5 +80,11 @@ class StrainStudy:
     full: FullRun  # the scene's own full run
     families: tuple[StrainFamily, ...]  # one or two
     times: FullTimes  # of the full run
+    turns: Turns  # full model and the most accurate reduced one in turn
     linear: float  # error in z of linear elasticity on the same scene
     none: str  # why there are no runs at other materials; empty when there are
+
+
+def most_accurate(families: Sequence[StrainFamily]) -> tuple[StrainPoint, StrainFamily]:
+    """The point of the least error on the scene's own run."""
+    return min(((p, f) for f in families for p in f.points), key=lambda pair: pair[0].error_own)
