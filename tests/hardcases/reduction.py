@@ -165,7 +165,7 @@ def _energy_change(case: FullRun, rom: SmallModel, force: Array, checked: bool) 
 
 
 def _rounding_of_energy(case: FullRun, rom: SmallModel, force: Array) -> float:
-    """N eps sqrt(steps), a random walk, times the products of the energy by size: |x|'|H||x| / 2 over its largest value."""
+    """N eps sqrt(steps), a random walk, times |x|'|H||x| / 2 over the largest energy: what its products cancel."""
     x = textbook_loop(rom, case.dt, force)[: MOVE + 1]
     terms = np.einsum("ki,ij,kj->k", abs(x), abs(rom.operators.total), abs(x)).max() / 2
     return math.sqrt(len(force)) * rom.N * EPS * float(terms / np.abs(rom.total_energy(x)).max())
