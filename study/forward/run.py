@@ -78,11 +78,7 @@ def run_simulate(
         try:
             run = simulate(model, options)
         except (Interrupted, ResourceError) as stopped:
-            if files := frames.close():
-                list_files(console, files)
-            if not isinstance(stopped, Paused):
-                raise
-            console.print(str(stopped), soft_wrap=True, markup=False)
+            _say_stopped(console, frames, stopped)
             return {}
     fields = frames.close()
     result = simulate_result(model, run, run_warnings(model, run, frames.most[1:]))
@@ -109,6 +105,15 @@ def run_simulate(
     if certify and mesh_error is None:
         raise SolverError(unknown)
     return numbers
+
+
+def _say_stopped(console: Console, frames: Frames, stopped: Interrupted | ResourceError) -> None:
+    """List the fields of a run that has stopped, and why; raise the reason unless it was asked for. Collective."""
+    if files := frames.close():
+        list_files(console, files)
+    if not isinstance(stopped, Paused):
+        raise stopped
+    console.print(str(stopped), soft_wrap=True, markup=False)
 
 
 def _few_fields(scene: Scene, n_e: int) -> str:
