@@ -140,7 +140,7 @@ def with_bounds[Figures: GainQuality](
 
     See :mod:`softgrasp.lqr.loop.gap`. ``cost_excess_proved`` holds for the run and the optimal feedback after it. What
     the loop's own way costs after that is an allowance in ``cost_excess_at_most``; while it is more than a tenth of the
-    excess, the run is made twice as long, :data:`LONGER` times at most.
+    excess of a gain that is offered, the run is made twice as long, :data:`LONGER` times at most.
 
     Args:
         solution: says what is to come after the end of the run; its error does not matter to the bound.
@@ -152,7 +152,8 @@ def with_bounds[Figures: GainQuality](
     for more in range(LONGER + 1):
         longer = replace(course, steps=course.steps << more)
         gaps = duality_gaps(problem, list(laws.values()), longer, solution, notify)
-        if all(gap.settled or not np.isfinite(gap.gap) for gap in gaps):
+        offered = [gap for i, gap in zip(laws, gaps, strict=True) if gains[i].stable and np.isfinite(gap.gap)]
+        if all(gap.settled for gap in offered):
             break
     for i, gap in zip(laws, gaps, strict=True):
         gains[i] = replace(
