@@ -60,7 +60,12 @@ def orders(design: Design) -> tuple[list[int], str]:
 
 
 def reduce_gains(
-    design: Design, orders: Sequence[int], notify: Notify | None = None, names: Sequence[str] = tuple(BASES)
+    design: Design,
+    orders: Sequence[int],
+    notify: Notify | None = None,
+    names: Sequence[str] = tuple(BASES),
+    *,
+    offered_only: bool = False,
 ) -> tuple[BasisGains, ...]:
     """Gains of the reduced Riccati equations over their orders, the best of each basis checked on the full plant.
 
@@ -71,6 +76,7 @@ def reduce_gains(
         orders: of the reduced equations; those that a basis has not are left out.
         notify: called with the number of equations done and at most.
         names: keys of :data:`softgrasp.lqr.reduced.bases.BASES`.
+        offered_only: leave out what a controller does not need: errors of P, and checks of gains of large order.
     """
     bases = []
     for i, name in enumerate(names):
@@ -81,11 +87,13 @@ def reduce_gains(
             continue
         reports = []
         for j, N in enumerate(family.orders(orders), 1):
-            reports.append(design.gain_check.first_look(family.at(N)))
+            reports.append(design.gain_check.first_look(family.at(N), error_P=not offered_only))
             if notify is not None:
                 notify(i * len(orders) + j, len(names) * len(orders))
         bases.append(BasisGains(name, family, tuple(reports)))
-    best = certified(design, _ranked(design, bases))
+    best = _ranked(design, bases)
+    if not offered_only:
+        best = certified(design, best)
     n_s = design.problem.layout.n_s
     offered = range(2 * n_s + 2, fast_order(n_s) + 1)  # to the controller
     return tuple(certified(design, [b], offered)[0] if b.name == A_PRIORI else b for b in best)
