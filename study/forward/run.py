@@ -56,6 +56,7 @@ def run_simulate(
     if resume:
         check_ranks(session.comm, out / "checkpoint")
     model = session.model(scene)
+    model.system.release()
     scene, frames, n_e = model.scene, Frames(model, out, session.pictures), model.system.layout.n_e
     if (count := frame_count(scene, n_e)) < FRAMES and scene.output.frames == "auto" and scene.output.fields != "none":
         text = f"fields at {count + 1} instants, for n_e is above {LIGHT}; --set output.frames={FRAMES} writes more"
