@@ -91,6 +91,11 @@ class BlockSystem:
     kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
+    def contrast(self) -> float:
+        """Largest lambda / mu of the materials [1]: 49 at nu = 0.49."""
+        return max(m.lam / m.mu for m in self.materials)
+
+    @property
     def fall(self) -> Array:
         """Free fall in the hand's degrees of freedom, zero without gravity, (n_s,) [m/s^2]."""
         return np.zeros(self.layout.n_s) if self.gravity is None else self.gravity

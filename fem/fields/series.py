@@ -78,8 +78,8 @@ class SeriesWriter:
             on_root(self.comm, self._begin)
         path = self.folder / f"{self.written:06}.vtu"
         check_room(self.comm, [path], needed, reserve)
-        write_vtu(self.comm, path, self.grid, points, cells, whole)
-        on_root(self.comm, lambda: self.list.add(t, path))
+        checks = write_vtu(self.comm, path, self.grid, points, cells, whole)
+        on_root(self.comm, lambda: self.list.add(t, path, checks))
         self.written += 1
 
     def _begin(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from softgrasp.fem.errors import CheckpointError, ResourceError, agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.resources import check_room, free_memory
+from softgrasp.fem.resources import MARGIN, check_room, free_memory
 from softgrasp.fem.run.midpoint import TissueState, state_on
 from softgrasp.fem.system import BlockSystem
 
@@ -197,11 +198,12 @@ class Hdf5Store(NoStore):
             check_room(comm, [self.path], 8 * len(self.buffer) * (end - self.written))
             with agree(comm):
                 try:
+                    _reserve(self.path, 8 * (len(self.buffer) + 1) * (end - self.written) + MARGIN)
                     with h5py.File(self.path, "r+") as file:
                         for j in range(self.written, end):
                             file["Z"][j] = self.buffer[:, j % self.width]
                         file.attrs["written"] = end
-                except OSError as error:
+                except (OSError, RuntimeError) as error:
                     raise ResourceError(f"{self.path} cannot be written ({error}); free the disk") from error
             self.written = end
 
@@ -221,6 +223,8 @@ class Hdf5Store(NoStore):
             )
         try:
             with h5py.File(path) as file:
+                if not file["Z"].fletcher32:
+                    raise ValueError("its numbers have no checksums")
                 for j in range(self.written):
                     file["Z"][j]  # HDF5 compares the checksum of what it reads
         except DAMAGE as error:
@@ -243,7 +247,7 @@ class Hdf5Store(NoStore):
         path, count = self.directory / "snapshots.h5", len(self.steps)
         try:
             note(path)
-            with h5py.File(path, "w") as file:
+            with h5py.File(path.name, "w", driver="core", backing_store=False) as file:  # written by Python
                 for key, part in (("z", 0), ("v", 1)):
                     joined = h5py.VirtualLayout((count, sum(sizes)), dtype="f8")
                     at = 0
@@ -255,8 +259,20 @@ class Hdf5Store(NoStore):
                 file["nodes"] = np.vstack(nodes)
                 file["times"], file["steps"] = times, self.steps
                 file["q_s"], file["v_s"] = q, v
+                file.flush()
+                image = file.id.get_file_image()
+            path.write_bytes(image)
         except OSError as error:
             raise ResourceError(f"{path} cannot be written ({error}); remove it or free the disk") from error
+
+
+def _reserve(path: Path, size: int) -> None:
+    """Take room on the disk behind the end of a file: HDF5, which gives back the rest, ends the program without it.
+
+    Raises OSError: there is none, or the user's quota or the limit of a file's size is reached.
+    """
+    with path.open("r+b") as file:
+        os.posix_fallocate(file.fileno(), file.seek(0, os.SEEK_END), size)
 
 
 def spread(count: int, few: int) -> np.ndarray:

@@ -41,6 +41,11 @@ class Gravity(Section):
     g: list[float] = Field(description="acceleration of gravity, one entry per axis [m/s2]")
     hand_weight: bool = Field(False, description="whether the hand weighs too [no unit]")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _bare(cls, value: Any) -> Any:
+        return {"g": value} if isinstance(value, list) else value  # gravity = [0, -9.81]
+
 
 class Damping(Section):
     """C = beta K (Kelvin-Voigt) or C = alpha M + beta K (Rayleigh)."""
@@ -125,7 +130,8 @@ class Time(Section):
     reproducible: Literal["auto"] | bool = Field(
         "auto",
         description="equal bits in every run on the same number of ranks: each holds the whole factor [no unit]; "
-        "auto: on up to 4 ranks, while the factors fit",
+        "auto: on up to 4 ranks, in 3D to 40 000 unknowns over the number of ranks; true takes about twice the time of "
+        "a spread factor beyond, and the memory of the whole one on each rank",
     )
 
 
