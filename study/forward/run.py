@@ -57,6 +57,7 @@ def run_simulate(
     if resume:
         check_ranks(session.comm, out / "checkpoint")
     model = session.model(scene)
+    model.system.release()
     scene, frames, n_e = model.scene, Frames(model, out, session.pictures), model.system.layout.n_e
     if few := _few_fields(scene, n_e):
         console.print(few, soft_wrap=True)
