@@ -115,6 +115,15 @@ class BlockSystem:
         """The paper's K_es, local rows (n_local, n_s)."""
         return sum_dense(_stiffness(self.layers, self.materials, "es"))
 
+    def release(self) -> None:
+        """Free the matrices of the affine components, three of the seven of a step, where no more are made. Collective.
+
+        The system steps as before; :meth:`with_materials`, reductions and bounds need what is gone.
+        """
+        for layer in self.layers:
+            for component in (layer.K_mu, layer.K_lambda, layer.M_1):
+                component.ee.destroy()
+
     def with_materials(self, materials: tuple[LayerMaterial, ...]) -> BlockSystem:
         """The same scene with other lambda, mu, rho, beta: a few axpy, no assembly. Collective."""
         M_ee, K_ee = tissue_matrices(self.layers, materials)
