@@ -91,7 +91,7 @@ def meet(comm: MPI.Intracomm) -> None:
 
 
 @contextmanager
-def agree(comm: MPI.Intracomm) -> Iterator[None]:
+def raise_on_all_ranks(comm: MPI.Intracomm) -> Iterator[None]:
     """Run a block that may fail on some ranks only; then raise on all of them.
 
     The exception of the lowest failing rank is raised on every rank, so no rank waits in a collective call that

@@ -112,7 +112,7 @@ class TissueMidpoint:
         self.G, self.rows = self.operators.G, self.operators.rows
         self.K2 = self.operators.K
         self.K2.scale(-2.0)
-        with self.operators.agree():
+        with self.operators.raise_on_all_ranks():
             self.solver: TissueSolver = make_solver(
                 self.operators.S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible, ordered
             )
@@ -238,7 +238,7 @@ class TissueMidpoint:
         solve missed its tolerance.
         """
         self.Y = np.empty(self.G.shape, order="F")
-        with self.operators.agree():
+        with self.operators.raise_on_all_ranks():
             for j in range(self.Y.shape[1]):
                 self.r.array_w[:] = self.G[:, j]
                 self.solver.solve(self.r, self.w)
@@ -321,7 +321,7 @@ class TissueMidpoint:
         """
         load = self.G[self.rows] @ self.c
         square = total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]
-        with self.operators.agree():
+        with self.operators.raise_on_all_ranks():
             return self.solver.check(self.r, self.w, "the midpoint", float(np.sqrt(square)))
 
     def figures(self) -> NewtonFigures | None:
