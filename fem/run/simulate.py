@@ -207,7 +207,7 @@ class Run(Stepped):
             energies=np.array([midpoint.dissipated, self.initial_energy, self.peak_energy]),
             residual_first=self.residual_first,
             forces=None if self.drive.u is None else self.drive.u[:n],
-            **midpoint.memory(),
+            **midpoint.restart_arrays(),
         )
 
     def restore(self, saved: RestartState) -> None:
@@ -238,8 +238,8 @@ class Run(Stepped):
         self.legs = [*(leg for leg in saved.legs if leg < n), n]
         for vector in (self.state.z, self.state.v, midpoint.r):
             vector.stateIncrease()
-        midpoint.join(self.state)
-        midpoint.recall(saved.solver_rows, saved.solver_numbers)
+        midpoint.adopt(self.state)
+        midpoint.restore(saved.solver_rows, saved.solver_numbers)
 
     def trajectory(self) -> Trajectory:
         """Gather the small results; the tissue stays distributed. Collective."""
