@@ -37,6 +37,10 @@ REPEATED_RANKS = 4
 # which grows with the condition though w may be right. One step of refinement measures the error of w itself.
 DIRECT_RESIDUAL = 1e-8
 DIRECT_ERROR = 1e-6
+OUT_OF_MEMORY = 3  # PC_FACTOR_OUTMEMORY
+# Percent beyond the estimate that MUMPS reserves on each rank. PETSc's 20 has failed on a busy machine, where ranks
+# that lag take less of the work than planned; pages that are not touched cost nothing.
+WORKSPACE = 100
 PACKAGES = {"petsc": "PETSc", "mumps": "MUMPS"}  # PETSc's names of those that factor
 
 
@@ -280,6 +284,9 @@ def make_solver(
         ksp.setType("preonly")
         ksp.getPC().setType("cholesky")
         ksp.getPC().setFactorSolverType("mumps")
+        if S.comm.size > 1:
+            ksp.getPC().setFactorSetUpSolverType()
+            ksp.getPC().getFactorMatrix().setMumpsIcntl(14, WORKSPACE)
     try:
         _factor(ksp, S, name)
     except SolverError:
@@ -344,7 +351,8 @@ def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
         ) from error
     reason = ksp.getPC().getFailedReason()
     if reason:
-        raise SolverError(f"{name}: set-up failed (reason {reason}); the matrix is not definite")
+        why = "out of memory or workspace; take more ranks" if reason == OUT_OF_MEMORY else "the matrix is not definite"
+        raise SolverError(f"{name}: set-up failed (reason {reason}); {why}")
 
 
 def _stars(S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float) -> TissueSolver:
