@@ -233,6 +233,7 @@ def refused(name: str, out: Path, *overrides: str) -> str:
     console = Console(file=io.StringIO(), quiet=MPI.COMM_WORLD.rank != 0)
     with pytest.raises(SoftgraspError) as caught:
         run_control(SCENES / f"{name}.toml", out, [*SMALL, *overrides], console, quiet=True, pictures=False)
+    MPI.COMM_WORLD.Barrier()  # rank 0 gives the folder back
     assert not out.exists()  # nothing half-written
     return str(caught.value)
 
