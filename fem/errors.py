@@ -1,18 +1,24 @@
-"""Errors for users, and how all ranks agree on them.
+"""Errors for users, raised on all ranks or on none.
 
 Every message is one sentence that names the file, key or value and says what would be right.
 """
 
 from __future__ import annotations
 
+import errno
+import stat
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # scenes are read without MPI
     from mpi4py import MPI
 
-LONGEST = 590  # letters of a sentence: some lines of a terminal
+SPIN = 1e-3  # time that a rank waits awake before it sleeps [s]
+NAP = 0.02  # longest sleep between two looks at the other ranks [s]
+LONGEST = 590  # letters of the longest sentence, some lines of a terminal [1]
 
 
 def one_line(text: str) -> str:
@@ -22,6 +28,16 @@ def one_line(text: str) -> str:
         text = f"{text[:half]} ... {text[-half:]}"
     shown = "".join(c if c.isprintable() or c == "\u00a0" else ascii(c)[1:-1] for c in text)
     return shown if len(shown) <= LONGEST else one_line(shown)
+
+
+def no_pipe(path: Path) -> Path:
+    """A file to be read, which a pipe is not: opening one waits for its writer, perhaps for ever.
+
+    Raises OSError: it is one.
+    """
+    if stat.S_ISFIFO(path.stat().st_mode):
+        raise OSError(errno.ESPIPE, "it is a pipe; write it to a file first", str(path))
+    return path
 
 
 def shortened(value: str) -> str:
@@ -41,11 +57,11 @@ class SceneError(SoftgraspError):
 
 
 class MeshError(SoftgraspError):
-    """A mesh cannot be read or cannot carry the model."""
+    """A mesh cannot be read, or is not fit for the model."""
 
 
 class SolverError(SoftgraspError):
-    """A linear solve failed or missed its tolerance."""
+    """A solve failed or missed its tolerance."""
 
 
 class ResourceError(SoftgraspError):
@@ -61,11 +77,22 @@ class Interrupted(SoftgraspError):
 
 
 class Paused(Interrupted):
-    """A run has come to the step up to which it was asked for."""
+    """A run has reached the step at which it was asked to pause."""
+
+
+def meet(comm: MPI.Intracomm) -> None:
+    """Barrier that sleeps when it takes long, since a rank that spins takes a core from those that work. Collective."""
+    if comm.size == 1:
+        return
+    everyone, begin, nap = comm.Ibarrier(), time.monotonic(), 0.0
+    while not everyone.Test():
+        if time.monotonic() - begin > SPIN:
+            nap = min(nap + NAP / 20, NAP)
+            time.sleep(nap)
 
 
 @contextmanager
-def agree(comm: MPI.Intracomm) -> Iterator[None]:
+def raise_on_all_ranks(comm: MPI.Intracomm) -> Iterator[None]:
     """Run a block that may fail on some ranks only; then raise on all of them.
 
     The exception of the lowest failing rank is raised on every rank, so no rank waits in a collective call that
@@ -78,6 +105,7 @@ def agree(comm: MPI.Intracomm) -> Iterator[None]:
         yield
     except Exception as error:
         caught = error
+    meet(comm)
     failures = [e for e in comm.allgather(caught) if e is not None]
     if failures:
         raise failures[0] from caught

@@ -19,7 +19,7 @@ from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc, combine, times_columns, total
 
 if TYPE_CHECKING:  # only scenes with finite strain load it
-    from softgrasp.fem.strain.points import Points
+    from softgrasp.fem.strain.points import QuadraturePoints
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,14 @@ class BlockSystem:
     hand_weight: bool = False  # gravity acts on the hand's own mass too
     two_way: bool = False  # the tissue acts on the hand
     graded: bool = False  # nodes crowd where cells shrink, so that Euclidean norms of node values mean little
-    points: Points | None = None  # where finite strain evaluates its law; None: K_ee z is the whole force
+    points: QuadraturePoints | None = None  # where finite strain evaluates its law; None: K_ee z is the whole force
     # factor and modes of K_ee, made by the first who asks (softgrasp.fem.solve.stiffness, softgrasp.fem.solve.modes)
     kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def contrast(self) -> float:
+        """Largest lambda / mu of the materials [1]: 49 at nu = 0.49."""
+        return max(m.lam / m.mu for m in self.materials)
 
     @property
     def fall(self) -> Array:
@@ -109,6 +114,15 @@ class BlockSystem:
     def K_es(self) -> Array:
         """The paper's K_es, local rows (n_local, n_s)."""
         return sum_dense(_stiffness(self.layers, self.materials, "es"))
+
+    def release(self) -> None:
+        """Free the matrices of the affine components, three of the seven of a step, where no more are made. Collective.
+
+        The system steps as before; :meth:`with_materials`, reductions and bounds need what is gone.
+        """
+        for layer in self.layers:
+            for component in (layer.K_mu, layer.K_lambda, layer.M_1):
+                component.ee.destroy()
 
     def with_materials(self, materials: tuple[LayerMaterial, ...]) -> BlockSystem:
         """The same scene with other lambda, mu, rho, beta: a few axpy, no assembly. Collective."""

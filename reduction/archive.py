@@ -16,7 +16,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
-from softgrasp.fem.errors import agree
+from softgrasp.fem.errors import no_pipe, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.owned import note
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from softgrasp.reduction.strain.model import StrainModel
 
 LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 3"
+# what h5py and the reading of a model raise of a file that is not whole
+DAMAGE = (OSError, LookupError, TypeError, ValueError, RuntimeError, AttributeError, MemoryError)
 CHECKSUMS = ("sha256", "sha256_lift")  # attributes: of everything but the reconstruction, and of the reconstruction
 ROWS = 1 << 16  # rows of the reconstruction read at a time: 30 MB for 60 columns
 # what a file says of a model in JSON, beside its materials and the names of its outputs
@@ -173,7 +175,7 @@ def write_model(
     comm = MPI.COMM_SELF if reconstruction is None else reconstruction.layout.comm
     unfinished = path.with_name(path.name + ".part")
     try:
-        with agree(comm):
+        with raise_on_all_ranks(comm):
             if comm.rank == 0:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 note(unfinished, path)
@@ -182,10 +184,10 @@ def write_model(
                     small(file)
         for rank in range(comm.size):
             # one file, one writer at a time: the file library here is not a parallel one
-            with agree(comm):
+            with raise_on_all_ranks(comm):
                 if reconstruction is not None and comm.rank == rank:
                     _write_rows(reconstruction, unfinished)
-        with agree(comm):
+        with raise_on_all_ranks(comm):
             if comm.rank == 0:
                 with h5py.File(unfinished, "r+") as file:
                     write_checksums(file)
@@ -204,9 +206,9 @@ def reading(
     Raises ModelError: the file is missing, damaged, or of another version or scene; or the block finds a key missing.
     """
     comm = MPI.COMM_SELF if layout is None else layout.comm
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         try:
-            with h5py.File(path, "r") as file:
+            with h5py.File(no_pipe(path), "r") as file:
                 if file.attrs.get("format") not in (LINEAR, STRAIN):
                     raise ModelError(f"{path} is no reduced model of this version ({LINEAR!r}); reduce the scene again")
                 # one rank reads a reconstruction twice, not all of them
@@ -218,7 +220,7 @@ def reading(
                     other = about["scene_hash"][:12]
                     raise ModelError(f"{path} was made for another scene (hash {other}); reduce the scene again")
                 yield file, about
-        except (OSError, KeyError, TypeError, ValueError) as error:
+        except DAMAGE as error:
             reason = f"{error} is missing" if isinstance(error, KeyError) else error
             raise ModelError(f"{path} cannot be read as a reduced model ({reason}); reduce the scene again") from error
 

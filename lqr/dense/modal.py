@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from softgrasp.fem.errors import ResourceError, SolverError, agree
+from softgrasp.fem.errors import ResourceError, SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, rows_on_root, times_columns, to_scipy, total
 from softgrasp.fem.solve.modes import lowest_modes
@@ -153,16 +153,27 @@ def modes_of_plant(problem: RiccatiProblem, k: int) -> tuple[Array, Array, Array
     if layout.n_e > DENSE_MODES:
         omega, Phi = lowest_modes(system, k)
         return omega, Phi, times_columns(system.M_ee, Phi)
+    key = (system.K_ee.handle, system.K_ee.stateGet(), system.M_ee.handle, system.M_ee.stateGet())
+    kept = system.kept.get("dense modes")
+    if kept is None or kept[0] != key or len(kept[1]) < k:
+        kept = key, *_modes_on_root(problem, k), system.K_ee, system.M_ee  # no other matrix can take their handles
+        system.kept["dense modes"] = kept
+    Phi = kept[2][:, :k].copy(order="F")
+    return kept[1][:k].copy(), Phi, times_columns(system.M_ee, Phi)
+
+
+def _modes_on_root(problem: RiccatiProblem, k: int) -> tuple[Array, Array]:
+    """Frequencies, and modes with local rows, by LAPACK. Collective."""
+    system, layout = problem.system, problem.layout
     M, K = gather_matrix(layout, system.M_ee), gather_matrix(layout, system.K_ee)
     modes: tuple[Array, Array] | None = None
-    with agree(layout.comm):
+    with raise_on_all_ranks(layout.comm):
         if M is not None and K is not None:
             squares, vectors = scipy.linalg.eigh(K, M, subset_by_index=[0, k - 1])
-            _check_held(squares[0], float(np.linalg.norm(K, 2) / np.diag(M).max()))
+            _check_held(squares[0], float(np.linalg.norm(K, 1) / np.diag(M).max()))
             modes = np.sqrt(squares), vectors
     omega, whole = layout.comm.bcast(modes)
-    Phi = np.asfortranarray(whole[layout.start : layout.start + layout.n_local])
-    return omega, Phi, times_columns(system.M_ee, Phi)
+    return omega, np.asfortranarray(whole[layout.start : layout.start + layout.n_local])
 
 
 def lowest_plant(problem: RiccatiProblem, k: int) -> ModalPlant:
@@ -297,7 +308,7 @@ class DenseRiccati:
         check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
         tissue = gather_tissue(problem)
         result: RiccatiSolution | None = None
-        with agree(comm):
+        with raise_on_all_ranks(comm):
             if tissue is not None:
                 result = self._solve_on_root(problem, tissue)
         return spread(layout, result)

@@ -16,6 +16,7 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import on_root
+from softgrasp.fem.run.simulate import frame_count
 from softgrasp.lqr.dense.care import solve_reduced
 from softgrasp.lqr.design.controller import CertifiedController, NoController, certified_controller
 from softgrasp.lqr.design.duration import LoopPlan, largest_cost
@@ -128,7 +129,7 @@ def run_loops(design: Design, bases: Sequence[BasisGains], plan: LoopPlan, frame
     def progress(run: Any) -> None:
         notify(done + run.reached, total)
 
-    shown = move_steps(plan.steps, plan.dt, plan.settle, 3 if frames.few else scene.output.frames)
+    shown = move_steps(plan.steps, plan.dt, plan.settle, 3 if frames.few else frame_count(scene, problem.layout.n_e))
     frames.chosen = set(shown)
     loop = ClosedLoop(problem, plan.dt, scene.time.solver, scene.time.rtol, scene.time.reproducible)
     options = LoopOptions(progress=progress, most=largest_cost(design, plan))

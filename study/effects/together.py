@@ -122,16 +122,17 @@ def _switched(runs: Experiments, tried: tuple[str, ...], on: Names, but: Names) 
 
 
 def _singles(runs: Experiments, tried: tuple[str, ...], on: Names, names: list[str], tolerance: float) -> Joined:
-    """Effects that show beside those that are on, with the partner or the partners that bring them out. Collective."""
+    """Effects that show beside those that are on, with a partner that brings them out, or all. Collective."""
     joined: Joined = {}
     for name in names:
         if (change := runs.shows(on, on | {name}, tolerance)) is None:
             continue
         others = _switched(runs, tried, on, frozenset({name}))
-        near = {p: runs.shows(runs.on ^ {p}, runs.on ^ {p, name}, tolerance) for p in others}
-        largest = max(((found, p) for p, found in near.items() if found is not None), default=None)
-        partners, change = (others, change) if largest is None else ((largest[1],), largest[0])
-        joined[name] = Shown(partners, False, (), *change)
+        for p in sorted(others, key=lambda p: (runs.on ^ {p}, True) not in runs.runs):  # those first that ran pushed
+            if (near := runs.shows(runs.on ^ {p}, runs.on ^ {p, name}, tolerance)) is not None:
+                others, change = (p,), near
+                break
+        joined[name] = Shown(others, False, (), *change)
     return joined
 
 

@@ -9,6 +9,7 @@ from softgrasp.fem.effects.gate import SMALL_SHARE
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.scales import SMALL_STRAIN, gradient, magnified, slowest
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.snapshots import spread
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.solve.solvers import ITERATIVE
@@ -34,7 +35,7 @@ def locking(poisson: dict[str, float], order: int) -> list[str]:
     """P1 elements in a material that hardly changes its volume."""
     return [
         f"nu = {_near_half(nu)} of {name} is above {STIFF}: P1 locks, its error grows with lambda / mu = "
-        f"{2 * nu / (1 - 2 * nu):.3g}; use tissue.order = 2."
+        f"{2 * nu / (1 - 2 * nu):.3g}; use tissue.order = 2, on half the cells along each edge for as many unknowns."
         for name, nu in poisson.items()
         if nu > STIFF + 1e-9 and order == 1
     ]
@@ -77,6 +78,11 @@ def inexact(drift: float, residual: float, solver: str, nu: float, rounding: flo
     digits = max(int(-np.log10(worst)), 0)
     left = f"only about {digits} digit{'' if digits == 1 else 's'}" if digits else "no digit"
     return [f"{name} {worst:.1e}: the numbers carry {left}, because {reason}."]
+
+
+def looked_at(n_e: int) -> int:
+    """Stored instants that the warnings of a run take, with n_e unknowns of the tissue."""
+    return int(np.clip(LARGEST // n_e, 4, LOOKED_AT))
 
 
 def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None = None) -> list[str]:
@@ -122,8 +128,6 @@ def _instants(run: Trajectory, system: BlockSystem) -> tuple[Array, list[float]]
     n = system.layout.n_local
     if run.snapshots is None:
         return run.final[:n, None], [float(run.times[-1])]
-    last = len(run.snapshots.times) - 1
-    count = int(np.clip(LARGEST // system.layout.n_e, 4, LOOKED_AT))
-    columns = np.unique(np.linspace(0, last, count).round().astype(int)).tolist()
+    columns = spread(len(run.snapshots.times), looked_at(system.layout.n_e)).tolist()
     times = [*run.snapshots.times[columns].tolist(), float(run.times[-1])]
     return np.column_stack([run.snapshots.Z[:n, columns], run.final[:n]]), times

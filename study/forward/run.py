@@ -16,9 +16,10 @@ from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError, SolverError
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.run.checkpoint import check_ranks
-from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.simulate import FRAMES, LIGHT, Run, RunOptions, frame_count, simulate
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estimate_error
-from softgrasp.study.forward.cautions import run_warnings
+from softgrasp.study.forward.cautions import looked_at, run_warnings
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import speed_up
@@ -57,7 +58,10 @@ def run_simulate(
     if resume:
         check_ranks(session.comm, out / "checkpoint")
     model = session.model(scene)
-    scene, frames = model.scene, Frames(model, out, session.pictures)
+    model.system.release()
+    scene, frames, n_e = model.scene, Frames(model, out, session.pictures), model.system.layout.n_e
+    if few := _few_fields(scene, n_e):
+        console.print(few, soft_wrap=True)
 
     def join(run: Run) -> None:
         frames.begin(run)
@@ -72,15 +76,11 @@ def run_simulate(
             kind = "steps" if newton is None else f"steps ({newton.mean:.2g} iterations each)"
             bar.update(task, completed=run.reached, description=kind)
 
-        options = RunOptions(out, resume, until, progress, frames, join, frames.keep)
+        options = RunOptions(out, resume, until, progress, frames, join, frames.keep, looked_at(n_e))
         try:
             run = simulate(model, options)
         except (Interrupted, ResourceError) as stopped:
-            if files := frames.close():
-                list_files(console, files)
-            if not isinstance(stopped, Paused):
-                raise
-            console.print(str(stopped), soft_wrap=True, markup=False)
+            _say_stopped(console, frames, stopped)
             return {}
     fields = frames.close()
     result = simulate_result(model, run, run_warnings(model, run, frames.most[1:]))
@@ -107,6 +107,23 @@ def run_simulate(
     if certify and mesh_error is None:
         raise SolverError(unknown)
     return numbers
+
+
+def _say_stopped(console: Console, frames: Frames, stopped: Interrupted | ResourceError) -> None:
+    """List the fields of a run that has stopped, and why; raise the reason unless it was asked for. Collective."""
+    if files := frames.close():
+        list_files(console, files)
+    if not isinstance(stopped, Paused):
+        raise stopped
+    console.print(str(stopped), soft_wrap=True, markup=False)
+
+
+def _few_fields(scene: Scene, n_e: int) -> str:
+    """That a large body has its fields written at few instants, unless the scene says at how many."""
+    count = frame_count(scene, n_e)
+    if count >= FRAMES or scene.output.frames != "auto" or scene.output.fields == "none":
+        return ""
+    return f"fields at {count + 1} instants, for n_e is above {LIGHT}; --set output.frames={FRAMES} writes more"
 
 
 def _lost(frames: Frames, run: Run) -> str:

@@ -12,7 +12,7 @@ import h5py
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.fem.errors import SceneError, agree
+from softgrasp.fem.errors import SceneError, raise_on_all_ranks
 from softgrasp.fem.mesh.scene_hash import scene_keys
 from softgrasp.fem.model.build import Model, Stopwatch, build
 from softgrasp.fem.owned import follow
@@ -78,13 +78,14 @@ def run_query(
         raise SceneError(f"--csv {out}: {why}; name a file in a folder that is there")
     own = parse_settings(settings)
     questions = [own] if batch is None else [{**own, **row} for row in read_batch(batch)]
-    if not h5py.is_hdf5(path):
-        what = "is no HDF5 file" if path.is_file() else "is a folder" if path.is_dir() else "is not there"
+    if not (path.is_file() and h5py.is_hdf5(path)):
+        other = "is a folder" if path.is_dir() else "is a pipe" if path.exists() else "is not there"
+        what = "is no HDF5 file" if path.is_file() else other
         raise SceneError(f"{path} {what}; name the certified model that softgrasp reduce SCENE --tolerance wrote")
     model = load_certified(path)
     many = [materials_of(model, setting) for setting in questions]
     drive = drive_of(model, motion, dt, len(many))
-    with agree(MPI.COMM_WORLD):
+    with raise_on_all_ranks(MPI.COMM_WORLD):
         if folder is not None and MPI.COMM_WORLD.rank == 0:
             read = [file for file in (path, motion, scene, batch) if file is not None]
             claim(folder, "query", model.fine.name, inputs=read, empty=empty)
@@ -109,12 +110,12 @@ def run_query(
     answers = QueryResult(path, model, each, seconds, batch is not None)
     _show(console, answers)
     if out is not None and any(answer.run is not None for answer in each):
-        with agree(MPI.COMM_WORLD):
+        with raise_on_all_ranks(MPI.COMM_WORLD):
             if MPI.COMM_WORLD.rank == 0:
                 answers.table().write_csv(out)
         list_files(console, [out])
     if folder is not None:
-        with agree(MPI.COMM_WORLD):
+        with raise_on_all_ranks(MPI.COMM_WORLD):
             if MPI.COMM_WORLD.rank == 0:
                 given = {"motion": motion, "dt": dt, "tolerance": tolerance, "fallback": fallback, "batch": batch}
                 options = [f"--{key} {shlex.quote(str(value))}" for key, value in given.items() if value is not None]

@@ -237,6 +237,7 @@ class Table(Experiments):
         self.on, self.scales = frozenset(on), SCALES
         self.scene = make_scene(effects={name: ALL_ON[name] for name in on})
         self.force = None if forced is None else lambda n, t, q, v: q
+        self.runs = {}
         self.formulas = {False: output, True: forced or output}
 
     def of(self, on: Names, forced: bool = False) -> Displacements:
