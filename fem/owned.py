@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import psutil
 
-from softgrasp.fem.errors import SceneError, agree, no_pipe
+from softgrasp.fem.errors import SceneError, no_pipe, raise_on_all_ranks
 
 if TYPE_CHECKING:  # pages are written without MPI
     from mpi4py import MPI
@@ -166,7 +166,7 @@ def locked(comm: MPI.Intracomm, folder: Path) -> Iterator[None]:
     if _held is not None and folder.resolve().is_relative_to(_held.folder):
         yield
         return
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         if comm.rank == 0:
             hold(folder)
     try:

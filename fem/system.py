@@ -19,7 +19,7 @@ from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc, combine, times_columns, total
 
 if TYPE_CHECKING:  # only scenes with finite strain load it
-    from softgrasp.fem.strain.points import Points
+    from softgrasp.fem.strain.points import QuadraturePoints
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class BlockSystem:
     hand_weight: bool = False  # gravity acts on the hand's own mass too
     two_way: bool = False  # the tissue acts on the hand
     graded: bool = False  # nodes crowd where cells shrink, so that Euclidean norms of node values mean little
-    points: Points | None = None  # where finite strain evaluates its law; None: K_ee z is the whole force
+    points: QuadraturePoints | None = None  # where finite strain evaluates its law; None: K_ee z is the whole force
     # factor and modes of K_ee, made by the first who asks (softgrasp.fem.solve.stiffness, softgrasp.fem.solve.modes)
     kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 

@@ -24,7 +24,7 @@ from softgrasp.fem.scene.scene import FiniteStrain, Scene
 from softgrasp.fem.system import Component, LayerBlocks
 
 if TYPE_CHECKING:
-    from softgrasp.fem.strain.points import Points
+    from softgrasp.fem.strain.points import QuadraturePoints
 
 
 @dataclass
@@ -216,9 +216,9 @@ def layer_numbers(mesh: TissueMesh, scene: Scene) -> tuple[tuple[str, ...], np.n
     return names if counts[-1] else names[:-1], numbers
 
 
-def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> Points:
+def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> QuadraturePoints:
     """Points of the owned cells; K(0) = K_ee to rounding. Collective."""
-    from softgrasp.fem.strain.points import Points, make_gradient  # only scenes with finite strain pay for it
+    from softgrasp.fem.strain.points import QuadraturePoints, make_gradient  # only scenes with finite strain pay for it
 
     d, V, order = space.mesh.dimension, space.V, scene.tissue.order
     edges, cells = space.mesh.edges, space.mesh.owned
@@ -232,7 +232,7 @@ def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> Po
     B = make_gradient(layout.comm, space.gradients(at), nodes, (layout.n_local, layout.n_e))
     cell = np.repeat(np.arange(first, first + cells), each)
     places = (space.mesh.vertices[:, :1] + at @ edges).reshape(-1, d)
-    return Points(B, vol, np.repeat(space.layer, each), cell, places, d, effect.law, effect.tol)
+    return QuadraturePoints(B, vol, np.repeat(space.layer, each), cell, places, d, effect.law, effect.tol)
 
 
 def _free_nodes(space: Discretisation) -> np.ndarray:

@@ -19,7 +19,7 @@ from softgrasp.fem.checksums import (
     write_arrays,
     write_manifest,
 )
-from softgrasp.fem.errors import CheckpointError, agree, shortened
+from softgrasp.fem.errors import CheckpointError, raise_on_all_ranks, shortened
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.mesh.scene_hash import scene_hash
@@ -79,7 +79,7 @@ def write_checkpoint(state: RestartState, scene: Scene, layout: BlockLayout, dir
     comm = layout.comm
     manifest = directory / "checkpoint.json"
     name, sha256 = f"{state.run}-step{state.step}-rank{comm.rank}.npz", ""
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         try:
             sha256 = write_arrays(directory / name, {"numbering": _numbering(layout), **state.arrays()})
         except OSError as error:
@@ -87,7 +87,7 @@ def write_checkpoint(state: RestartState, scene: Scene, layout: BlockLayout, dir
                 f"{directory}: the restart file cannot be written ({error}); free the disk"
             ) from error
     files = comm.gather((name, sha256))
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         if files is not None:
             _write_manifest(state, scene, manifest, files)
     return manifest
@@ -119,7 +119,7 @@ def read_checkpoint(scene: Scene, layout: BlockLayout, directory: Path) -> Resta
     Raises:
         CheckpointError: no restart file, a damaged one, or one of another scene, rank count, mesh numbering or format.
     """
-    with agree(layout.comm):
+    with raise_on_all_ranks(layout.comm):
         manifest = directory / "checkpoint.json"
         entry = _fitting(scene, layout.comm.size, manifest, read_manifest(manifest, FORMAT))
         name, sha256 = entry["files"][layout.comm.rank]
@@ -138,7 +138,7 @@ def check_ranks(comm: MPI.Intracomm, directory: Path) -> None:
 
     Raises CheckpointError: no restart file, a damaged one, or one of another rank count.
     """
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         if comm.rank == 0:
             manifest = directory / "checkpoint.json"
             _same_ranks(manifest, read_manifest(manifest, FORMAT), comm.size)

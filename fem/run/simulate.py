@@ -13,7 +13,15 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.checksums import AGAIN
-from softgrasp.fem.errors import CheckpointError, Interrupted, Paused, ResourceError, SceneError, SolverError, agree
+from softgrasp.fem.errors import (
+    CheckpointError,
+    Interrupted,
+    Paused,
+    ResourceError,
+    SceneError,
+    SolverError,
+    raise_on_all_ranks,
+)
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.memory import solver_of
 from softgrasp.fem.model.outputs import Output, make_outputs
@@ -147,7 +155,7 @@ class Run(Stepped):
         self._check_force(before)
 
     def _check_force(self, begin: int) -> None:
-        with agree(self.layout.comm):  # a callable may differ between the ranks
+        with raise_on_all_ranks(self.layout.comm):  # a callable may differ between the ranks
             self.drive.check(begin, self.reached + 1)
 
     def force(self) -> Array:
@@ -199,7 +207,7 @@ class Run(Stepped):
             energies=np.array([midpoint.dissipated, self.initial_energy, self.peak_energy]),
             residual_first=self.residual_first,
             forces=None if self.drive.u is None else self.drive.u[:n],
-            **midpoint.memory(),
+            **midpoint.restart_arrays(),
         )
 
     def restore(self, saved: RestartState) -> None:
@@ -208,7 +216,7 @@ class Run(Stepped):
         Raises CheckpointError: the state is of another mesh numbering, or the streamed snapshots do not fit to it.
         """
         n, midpoint = saved.step, self.midpoint
-        with agree(self.layout.comm):
+        with raise_on_all_ranks(self.layout.comm):
             self.store.restore(saved.snapshots, n, saved.run)
             if len(saved.r) != len(midpoint.r_array):
                 raise CheckpointError(
@@ -230,8 +238,8 @@ class Run(Stepped):
         self.legs = [*(leg for leg in saved.legs if leg < n), n]
         for vector in (self.state.z, self.state.v, midpoint.r):
             vector.stateIncrease()
-        midpoint.join(self.state)
-        midpoint.recall(saved.solver_rows, saved.solver_numbers)
+        midpoint.adopt(self.state)
+        midpoint.restore(saved.solver_rows, saved.solver_numbers)
 
     def trajectory(self) -> Trajectory:
         """Gather the small results; the tissue stays distributed. Collective."""

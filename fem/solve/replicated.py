@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softgrasp.fem.errors import agree
+from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, rows_on_all, whole_copy
 from softgrasp.fem.solve.cholesky import NodeOrder, dissect
@@ -31,12 +31,12 @@ class ReplicatedOperators:
     M: PETSc.Mat | None  # mass, only beside D
     parts: tuple[PETSc.Mat, ...] = ()  # further matrices that were asked for, on the same rows; whoever asked owns them
 
-    def agree(self) -> AbstractContextManager[None]:
+    def raise_on_all_ranks(self) -> AbstractContextManager[None]:
         """Guard of a block that is a rank's own affair when it has all rows, and collective otherwise. Collective.
 
         The block must not communicate by itself.
         """
-        return agree(self.layout.comm) if self.whole else nullcontext()
+        return raise_on_all_ranks(self.layout.comm) if self.whole else nullcontext()
 
     def gather(self, local: Array) -> Array:
         """Rows here of a vector given by its owned rows. Collective."""

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from softgrasp.fem.errors import SolverError, agree
+from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, petsc_options, total, whole_copy
 from softgrasp.fem.solve.cholesky import (
@@ -302,7 +302,7 @@ def _repeated(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float) 
     nodes = np.arange(layout.n_e // layout.dimension)
     ksp = make_ksp(whole_copy(S), prefix, "mumps")
     try:
-        with agree(S.comm.tompi4py()):
+        with raise_on_all_ranks(S.comm.tompi4py()):
             _factor(ksp, S, "mumps")
     except SolverError:
         ksp.destroy()
@@ -328,7 +328,7 @@ def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, 
         order, P = dissection.order, dissection.matrix(every)
         every.destroy()
     try:
-        with agree(S.comm.tompi4py()):
+        with raise_on_all_ranks(S.comm.tompi4py()):
             ksp = factor_blocks(P, prefix, "petsc" if layout.n_e <= FEW_LIMIT[layout.dimension] else "mumps")
     except SolverError:
         S.destroy()

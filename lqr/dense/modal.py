@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from softgrasp.fem.errors import ResourceError, SolverError, agree
+from softgrasp.fem.errors import ResourceError, SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, rows_on_root, times_columns, to_scipy, total
 from softgrasp.fem.solve.modes import lowest_modes
@@ -167,7 +167,7 @@ def _modes_on_root(problem: RiccatiProblem, k: int) -> tuple[Array, Array]:
     system, layout = problem.system, problem.layout
     M, K = gather_matrix(layout, system.M_ee), gather_matrix(layout, system.K_ee)
     modes: tuple[Array, Array] | None = None
-    with agree(layout.comm):
+    with raise_on_all_ranks(layout.comm):
         if M is not None and K is not None:
             squares, vectors = scipy.linalg.eigh(K, M, subset_by_index=[0, k - 1])
             _check_held(squares[0], float(np.linalg.norm(K, 1) / np.diag(M).max()))
@@ -308,7 +308,7 @@ class DenseRiccati:
         check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
         tissue = gather_tissue(problem)
         result: RiccatiSolution | None = None
-        with agree(comm):
+        with raise_on_all_ranks(comm):
             if tissue is not None:
                 result = self._solve_on_root(problem, tissue)
         return spread(layout, result)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.checksums import write_arrays
-from softgrasp.fem.errors import agree, no_pipe
+from softgrasp.fem.errors import no_pipe, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
@@ -199,7 +199,7 @@ def save_gain(path: Path, gain: Gain, target: PlantState, layout: BlockLayout, s
     """
     sorted_ = _sorted(layout)
     parts = layout.comm.gather(np.column_stack([gain.K_z, gain.K_v, target.z, target.v_z]))
-    with agree(layout.comm):
+    with raise_on_all_ranks(layout.comm):
         if parts is not None and sorted_ is not None:
             meta = {"format": FORMAT, "scene_hash": scene_hash, "layout_hash": sorted_[1]}
             arrays = {"K_s": gain.K_s, "q_s": target.q_s, "v_s": target.v_s}
@@ -214,7 +214,7 @@ def load_gain(path: Path, layout: BlockLayout, scene_hash: str | None = None) ->
     """
     sorted_, ranges = _sorted(layout), layout.comm.gather((layout.start, layout.start + layout.n_local))
     pieces: list[tuple[Array, ...]] | None = None  # each rank is sent its own rows
-    with agree(layout.comm):
+    with raise_on_all_ranks(layout.comm):
         if sorted_ is not None and ranges is not None:
             _, arrays = read_npz(path, {"layout_hash": sorted_[1], "scene_hash": scene_hash})
             try:

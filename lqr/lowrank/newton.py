@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.checksums import digest, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
-from softgrasp.fem.errors import CheckpointError, SolverError, agree
+from softgrasp.fem.errors import CheckpointError, SolverError, raise_on_all_ranks
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.lowrank.adi import SHARE, AdiSweep, FactorColumns, adi_step, sweep_norms
 from softgrasp.lqr.lowrank.adjoint import AdjointRhs, adjoint_rhs
@@ -79,13 +79,13 @@ def save_state(folder: Path, plant: Plant, state: Iteration, sweep: AdiSweep) ->
         entries |= {"factor_hand": U.hand, "factor_tall": U.tall, "factor_signs": signs}
     comm = plant.comm
     name, sha256 = f"newton-solve{state.solves}-rank{comm.rank}.npz", ""
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         try:
             sha256 = write_arrays(folder / name, entries)
         except OSError as error:
             raise CheckpointError(f"{folder}: the restart file cannot be written ({error}); free the disk") from error
     files = comm.gather((name, sha256))
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         if files is not None:
             try:
                 write_manifest(_manifest(folder), {"format": FORMAT, "ranks": comm.size, "files": files})
@@ -104,7 +104,7 @@ def load_state(folder: Path, plant: Plant, state: Iteration, tol: float) -> AdiS
         return None
     sweep: AdiSweep | None = None
     advice = f"remove the folder {folder}"
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         entry = read_manifest(manifest, FORMAT, advice)
         foreign = f"{manifest} belongs to another control problem or rank count; {advice} or name another one"
         if entry["ranks"] != comm.size:
