@@ -34,15 +34,14 @@ class KrylovModel:
     """M xi'' + D xi' + K xi = G c, z = V xi, of a model; small arrays on every rank."""
 
     V: Array  # basis, local rows (n_local, N), with V' K V = 1
-    # M, D: projected mass and damping (N, N)
-    M: Array
-    D: Array
-    G: Array  # coupling (N, n_s)
-    C: Array  # outputs of the tissue against the hand (p, N)
-    C_s: Array  # their rigid part (p, n_s)
+    M: Array  # projected mass V' M_ee V, (N, N)
+    D: Array  # projected damping V' D_ee V, (N, N)
+    G: Array  # projected coupling V' G, (N, n_s)
+    C: Array  # outputs of the deformation, C_z' V, (p, N)
+    C_s: Array  # outputs of the rigid motion, (p, n_s)
     # static solutions K_ee^-1 [G, C'], local rows (n_local, n_s + p); columns of outputs that are none are zero
     X: Array
-    model: Model  # whose it is
+    model: Model  # full model
 
     @cached_property
     def run(self) -> KrylovRun:

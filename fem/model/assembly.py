@@ -29,25 +29,25 @@ if TYPE_CHECKING:
 
 @dataclass
 class Inventory:
-    """What an assembly made: names of compiled forms and of allocated tissue operators."""
+    """Names of the forms and tissue operators that an assembly made."""
 
-    forms: list[str] = field(default_factory=list)
-    operators: list[str] = field(default_factory=list)
+    forms: list[str] = field(default_factory=list)  # names of the compiled forms
+    operators: list[str] = field(default_factory=list)  # names of the allocated tissue operators
 
 
 @dataclass(frozen=True)
 class Discretisation:
     """Function space and the split of its nodes into contact and free ones."""
 
-    mesh: TissueMesh
+    mesh: TissueMesh  # distributed mesh with its marks
     V: Any  # displacement space (Lagrange P1 or P2, blocked)
-    contact: np.ndarray  # owned local node indices that follow the hand
-    free: np.ndarray  # owned local node indices of the tissue unknowns
+    contact: np.ndarray  # local numbers of the owned nodes that follow the hand, (k,)
+    free: np.ndarray  # local numbers of the owned nodes of the tissue unknowns, (n_local / d,)
     is_e: PETSc.IS  # PETSc index set of the free dofs (blocked)
     R: Array  # rigid modes on the contact rows, zero elsewhere, (owned dofs, n_s)
-    layout: BlockLayout
+    layout: BlockLayout  # sizes and ownership of the unknowns
     layers: tuple[str, ...]  # names of the layers
-    layer: np.ndarray  # number of the layer of each owned cell
+    layer: np.ndarray  # number of the layer of each owned cell, (owned cells,)
 
     def nodal(self, free: Array, held: Array | float = 0.0) -> Any:
         """The function with these values (n_local,) on the free dofs and ``held`` on the others. Collective."""

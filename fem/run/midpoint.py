@@ -47,11 +47,11 @@ def viscosity(system: BlockSystem, s: float) -> PETSc.Mat:
 
 @dataclass
 class TissueState:
-    """Relative displacement and velocity of the tissue as PETSc vectors that share one local array [z; v]."""
+    """Displacement and velocity of the tissue against the hand, as PETSc vectors on one local array."""
 
-    array: Array
-    z: PETSc.Vec
-    v: PETSc.Vec
+    array: Array  # [z; v] of this rank's nodes, (2 n_local,) [m; m/s]
+    z: PETSc.Vec  # displacement against the hand, on the first half of ``array``, (n_e,) [m]
+    v: PETSc.Vec  # velocity against the hand, on the second half of ``array``, (n_e,) [m/s]
 
 
 def state_on(array: Array, system: BlockSystem) -> TissueState:
@@ -89,12 +89,13 @@ class TissueMidpoint:
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 
     Attributes:
-        operators: on the rows here.
-        r, w, k: vectors on the rows here; ``r_array``, ``w_array``, ``k_array`` their arrays.
+        operators: operators of the step, on the rows here.
+        r: right-hand side of the step, on the rows here; ``r_array`` is its array.
+        w: half the change of z in the step, z_mid - z_n, on the rows here [m]; ``w_array`` is its array.
         c: coefficients of the load of the step in work, (n_s,).
         pending: coefficients p of the load that r still lacks between steps, h = r + G p, (n_s,).
         K2: -2 K, whose product one call adds to r.
-        k: K2 z; a step carries it where damping needs the old one.
+        k: K2 z, on the rows here [N]; carried from step to step where damping is on; ``k_array`` is its array.
         x: the rows of w that this rank owns, in the order of the state; w itself unless the vectors are whole here.
     """
 
