@@ -27,7 +27,8 @@ SIDES = {2: ["left", "right", "bottom", "top", "x-", "x+", "y-", "y+"], 3: ["lef
          "back", "z-", "z+"]}  # fmt: skip
 MOST_DENSE = 260  # unknowns of a linear run that is repeated with dense matrices
 DRIFT = 1e-9  # of the energy in a direct linear run: rounding, of materials up to nu = 0.499
-DENSE = 1e-6  # a run against the same with dense matrices: rounding, and cg stops at 1e-10 of its residual
+DENSE = 1e-6  # a run against the same with dense matrices: rounding
+ITERATED = 1e-3  # the same of cg, which stops at 1e-4 of its residual: seen up to 5e-4 in few long steps
 
 
 def pick(rng: Rng, *choices: Any) -> Any:
@@ -241,10 +242,10 @@ def check_answer(file: Path, out: Path) -> None:
         error = result["mesh_error"]
         assert 0 <= error["estimate"] <= error["bound"] * (1 + 1e-12), "an estimate above its bound"
     if scene.effects.finite_strain is None and result["n_e"] <= MOST_DENSE and scene.tissue.refine is None and not told:
-        compare(build(scene), table, header)
+        compare(build(scene), table, DENSE if direct else ITERATED)
 
 
-def compare(model: Model, table: Any, header: list[str]) -> None:
+def compare(model: Model, table: Any, limit: float) -> None:
     """The outputs of the run against those of dense matrices in coordinates where K = 1."""
     system = model.system
     L = np.linalg.cholesky(to_scipy(system.K_ee).toarray())
@@ -262,6 +263,6 @@ def compare(model: Model, table: Any, header: list[str]) -> None:
     y = table[:, at : at + expected.shape[1]]
     scale = max(float(np.abs(expected).max()), float(np.abs(dense.deformation).max()))
     off = float(np.abs(y - expected).max())
-    assert off <= DENSE * scale or math.isclose(off, 0.0, abs_tol=1e-14), (
+    assert off <= limit * scale or math.isclose(off, 0.0, abs_tol=1e-14), (
         f"outputs off by {off / scale:.1e} of {scale:.1e}"
     )

@@ -39,7 +39,8 @@ def test_surpluses_tell_what_solves_on_the_next_order_tell(
     full, _ = difference(small, krylov_model(up))
     few, _ = difference(small, surplus_model(small, up, iterations))
     many, _ = difference(small, surplus_model(small, up, 25))
-    assert few == pytest.approx(full, rel=off)
+    # on ranks the stars at their seams and the coarse level are inexact, which costs an iteration
+    assert few == pytest.approx(full, rel=off if comm.size == 1 else 2 * off)
     assert many == pytest.approx(full, rel=2e-3)  # what the blocks of the full model know beside e
 
 
