@@ -106,12 +106,12 @@ def _effectivity(old: Array, error: Array, new: Array) -> float:
     return float(np.clip(value, SEEN, MOST_ACCEPTED))
 
 
-def estimated(model: Model) -> MeshEstimate:
+def estimated(model: Model, *, surplus: bool = False, cells: list[int] | None = None) -> MeshEstimate:
     """The estimate of a model that was built without one, against the tolerance of its scene if it has one. Collective.
 
     Raises SolverError, SceneError, MeshError: see :func:`softgrasp.fem.accuracy.estimate.estimate`.
     """
-    result, refine = estimate(model), model.scene.tissue.refine
+    result, refine = estimate(model, surplus=surplus, cells=cells), model.scene.tissue.refine
     if refine is None or refine.tolerance is None:
         return result
     limit, cause = (

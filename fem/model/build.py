@@ -37,7 +37,7 @@ class MeshEstimate:
 
     estimate: float  # largest |delta y| over the run, relative [1]
     bound: float  # relative error that was not exceeded wherever it could be checked [1]
-    # estimate of y - y_h at the time steps, (steps + 1, p) [m, rad]; y_h + delta is the corrected output
+    # estimate of y - y_h at the time steps, zero if by "coarser", (steps + 1, p) [m, rad]; y_h + delta is corrected
     delta: Array = field(repr=False)
     # relative errors of the two lowest frequencies that the run can see, omega_h / omega - 1 [1]
     omega: tuple[float, ...]
@@ -45,7 +45,9 @@ class MeshEstimate:
     shift: float  # largest distance of the ends of the zone held from ``contact.box`` [m]
     n_e: int  # tissue unknowns of the mesh that was estimated [1]
     finer: int  # tissue unknowns of the mesh that it was compared with [1]
-    by: str  # finer mesh: "order", the next order on the same cells, or "graded", another mesh, which meets the zone
+    # finer mesh: "order", the next order on the same cells, or "graded", another mesh, which meets the zone; "coarser":
+    # the error is that of a mesh of fewer cells, about as large or larger
+    by: str
     tolerance: float | None = None  # tolerance of the scene [1], or None
     passes: int = 0  # number of refinements after the first estimate [1]
     obstacle: str = ""  # reason why the tolerance was not reached, or ""

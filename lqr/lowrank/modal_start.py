@@ -28,12 +28,12 @@ CORRECTIONS = 4  # Newton steps from the solution on a smaller space; more cost 
 class ModalStart:
     """Gain and shifts of the modal problem."""
 
-    gain: Block  # K', local rows, z-row as it stands
-    poles: np.ndarray  # closed-loop poles, most important first, one of each pair, Im >= 0
+    gain: Block  # K' with unscaled z-row, hand (2 n_s, m), local rows (2 n_local, m)
+    poles: np.ndarray  # closed-loop poles [1/s], most important first, one of each pair, Im >= 0, (k,)
 
 
-class _MovedMass:
-    """M_ee - G M_s^{-1} G': inertia of the tissue when the hand gives way (two-way coupling)."""
+class _SchurMass:
+    """M_ee - G M_s^{-1} G': mass of the tissue with the free hand eliminated (two-way coupling)."""
 
     def __init__(self, system: BlockSystem, M_s: Array) -> None:
         self.M, self.G, self.comm = system.M_ee, system.G, system.layout.comm
@@ -66,7 +66,7 @@ def plant_modes(plant: Plant, k: int) -> tuple[Array, Array]:
 def _floating(plant: Plant, k: int) -> tuple[Array, Array]:
     """Modes of K_ee and M_ee - G M_s^{-1} G', computed. Collective."""
     system = plant.system
-    shell = PETSc.Mat().createPython(system.M_ee.getSizes(), _MovedMass(system, plant.M_s), comm=system.layout.comm)
+    shell = PETSc.Mat().createPython(system.M_ee.getSizes(), _SchurMass(system, plant.M_s), comm=system.layout.comm)
     shell.setUp()
     try:
         return lowest_modes(replace(system, M_ee=shell), k)
