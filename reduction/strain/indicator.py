@@ -1,4 +1,4 @@
-"""An estimate of how far a reduced run is off, from its residual in more columns of its basis and on other cells.
+"""An estimate of the error of a reduced run, from its residual in more columns of its basis and on other cells.
 
 The run (a, v) is put into the finer equation, whose first columns are its own; with e the coordinates of its error,
 
