@@ -35,7 +35,7 @@ RANDOM = 100  # parameters beside the grid where the finished model is looked at
 ADDED = 10  # of these become points of the training at most, each as the worst one above what the grid has reached
 PLACES = 4  # trained parameters at which the mesh is estimated
 ROUNDING = 1e-11  # of a run's length: what is left of it below is rounding
-CHUNK = 50  # parameters that are looked at together
+WATCHED = 20  # parameters by which the size of the smaller basis is found, before all are looked at
 SEED = 20
 
 
@@ -293,40 +293,39 @@ def build_certified(
         last = replace(state.rounds[-1], bound=bounds[worst], worst=len(state.known))
         state = Greedy((*state.rounds[:-1], last), np.append(state.known, bounds[worst]))
     model = replace(trainer.certified, training=history(trainer, state), tolerance=tolerance)
-    many = [*trainer.parameters, *random]
-    if options.certify != "proof":
-        model = smallest(trainer, model, many, tolerance)
-    proved = trainer.bounds_at(many, model)
+    many, known = [*trainer.parameters, *random], [*state.known, *bounds]
+    if options.certify == "proof":
+        proved = trainer.bounds_at(many, model)
+    else:
+        model, proved = smallest(trainer, model, many, known, tolerance)
     about = {"proved": max(proved), "checked": len(many), "why": REASONS[state.reason]}
     drive = scene_drive(trainer.model.scene, trainer.model.system.M_hand)
     certify = "estimate" if options.certify == "estimate" and model.certify == "two" else model.certify
     return replace(model, training={**model.training, **about}, drive=drive, certify=certify)
 
 
-def smallest(trainer: Trainer, model: CertifiedModel, many: list[Materials], tolerance: float) -> CertifiedModel:
-    """The same with the least leading basis whose certificate is within the tolerance everywhere. Collective.
+def smallest(
+    trainer: Trainer, model: CertifiedModel, many: Sequence[Materials], known: Sequence[float], tolerance: float
+) -> tuple[CertifiedModel, list[float]]:
+    """The same with the least leading basis whose certificate is within the tolerance everywhere, and its bounds.
 
-    Where none is, all modes make the answer, with one basis and its own bound.
+    Bisection with the parameters of the largest ``known`` bounds; all are looked at where it ends, and those above the
+    tolerance join. Where no basis will do, all modes make the answer, with one basis and its own bound. Collective.
     """
-    low, high, best = 0, model.k2, model
-    while high - low > 1:
-        k = (low + high) // 2
-        part = replace(model, k=k, certify="two")
-        if within(trainer, part, many, tolerance):
-            high, best = k, part
-        else:
-            low = k
-    return best
-
-
-def within(trainer: Trainer, model: CertifiedModel, many: list[Materials], tolerance: float) -> bool:
-    """Whether the certificate is within the tolerance everywhere; points that fail move to the front. Collective."""
-    for at in range(0, len(many), CHUNK):
-        bounds = trainer.bounds_at(many[at : at + CHUNK], model)
-        if max(bounds) > tolerance:
-            many.insert(0, many.pop(at + int(np.argmax(bounds))))
-            return False
-    return True
+    watched = [int(i) for i in np.argsort(-np.array(known), kind="stable")[:WATCHED]]
+    low, high = 0, model.k2
+    while True:
+        while high - low > 1:
+            k = (low + high) // 2
+            bounds = trainer.bounds_at([many[i] for i in watched], replace(model, k=k, certify="two"))
+            low, high = (low, k) if max(bounds) <= tolerance else (k, high)
+        part = replace(model, k=high, certify="two") if high < model.k2 else model
+        bounds = trainer.bounds_at(many, part)
+        above = [i for i, bound in enumerate(bounds) if bound > tolerance]
+        if not above or high == model.k2:
+            return part, bounds
+        watched += [i for i in above if i not in watched]
+        low, high = high, model.k2
 
 
 def mesh_number(model: Model, places: Sequence[Materials]) -> MeshNumber:
