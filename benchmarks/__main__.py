@@ -1,4 +1,4 @@
-"""``python -m benchmarks forward | riccati | bases | switches | meshes | accuracy | certified``."""
+"""``python -m benchmarks forward | riccati | meshes | accuracy | certified``."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ from typing import Any
 import typer
 from mpi4py import MPI
 
-from benchmarks import accuracy, bases, certified, forward, forward_rows, meshes, riccati, switches
+from benchmarks import accuracy, certified, forward, forward_rows, meshes, riccati
 from softgrasp.study.shell.ending import run_command
 
 COMMANDS = {
-    "forward": forward, "riccati": riccati, "bases": bases, "switches": switches, "meshes": meshes,
-    "accuracy": accuracy, "certified": certified,
+    "forward": forward, "riccati": riccati, "meshes": meshes, "accuracy": accuracy, "certified": certified,
 }  # fmt: skip
 WORKERS: dict[str, Callable[..., Iterable[Any]]] = {
-    "forward": forward_rows.measure_row, "riccati": riccati.measure_row, "bases": bases.measure,
-    "switches": switches.measure,
+    "forward": forward_rows.measure_row, "riccati": riccati.measure_row,
 }  # fmt: skip
 
 app = typer.Typer(
@@ -28,7 +26,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    help="What runs, Riccati equations and bases cost, beside other codes. Keep the machine quiet.",
+    help="What runs and Riccati equations cost, beside other codes. Keep the machine quiet.",
 )
 for _name, _module in COMMANDS.items():
     app.command(name=_name, help=_module.HELP)(_module.main)

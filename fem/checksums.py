@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from softgrasp.fem.errors import CheckpointError
+from softgrasp.fem.errors import CheckpointError, no_pipe
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 
@@ -69,7 +69,7 @@ def read_arrays(path: Path, sha256: str | None, advice: str = AGAIN) -> dict[str
     Raises CheckpointError: the file is missing or not as it was written.
     """
     try:
-        with path.open("rb") as file:
+        with no_pipe(path).open("rb") as file:
             if hashlib.file_digest(file, "sha256").hexdigest() != sha256:
                 raise CheckpointError(f"{path} is damaged: it is not what its manifest says; {advice}")
             file.seek(0)
@@ -96,7 +96,7 @@ def write_manifest(path: Path, entry: Mapping[str, Any]) -> None:
 def read_manifest(path: Path, format: int, advice: str = AGAIN) -> dict[str, Any]:
     """Read a manifest back. Raises CheckpointError: it is missing, of another format, or not as it was written."""
     try:
-        entry = json.loads(path.read_bytes())
+        entry = json.loads(no_pipe(path).read_bytes())
     except FileNotFoundError:
         raise CheckpointError(f"{path} does not exist; run once without --resume") from None
     except (OSError, ValueError, RecursionError) as error:

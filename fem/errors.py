@@ -5,8 +5,11 @@ Every message is one sentence that names the file, key or value and says what wo
 
 from __future__ import annotations
 
+import errno
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # scenes are read without MPI
@@ -22,6 +25,16 @@ def one_line(text: str) -> str:
         text = f"{text[:half]} ... {text[-half:]}"
     shown = "".join(c if c.isprintable() or c == "\u00a0" else ascii(c)[1:-1] for c in text)
     return shown if len(shown) <= LONGEST else one_line(shown)
+
+
+def no_pipe(path: Path) -> Path:
+    """A file to be read, which a pipe is not: opening one waits for its writer, perhaps for ever.
+
+    Raises OSError: it is one.
+    """
+    if stat.S_ISFIFO(path.stat().st_mode):
+        raise OSError(errno.ESPIPE, "it is a pipe; write it to a file first", str(path))
+    return path
 
 
 def shortened(value: str) -> str:

@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array
 
 Place = tuple[tuple[float, ...], int, int]  # of a node: coordinates [m], owning rank, its number there
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Stars of the vertices of elements of order 2 and more, and the linear functions of the vertices at the nodes.
+
+    Nodes have their global numbers among the free ones, vertices theirs among the free vertices.
+    """
+
+    star: NDArray[Any]  # number of a star of this rank, ascending, for each node in it, (pairs,)
+    node: NDArray[Any]  # that node, (pairs,)
+    row: NDArray[Any]  # an owned node where a linear function is not zero, (entries,)
+    column: NDArray[Any]  # the vertex of that function, (entries,)
+    weight: Array  # its value there [1], (entries,)
+    vertices: NDArray[Any]  # places of the owned free vertices among the owned free nodes, (count,)
+    count: int  # number of owned free vertices
 
 
 @dataclass(frozen=True)
@@ -26,6 +45,7 @@ class BlockLayout:
     reference: Array  # the hand's reference point [m], (d,)
     extent: float = 1.0  # longest side of the bounding box of the free nodes [m], the same on every rank
     held: Array = field(default_factory=lambda: np.zeros((0, 0)))  # owned nodes that follow the hand [m], (k, d)
+    patches: Callable[[], Patches] | None = None  # makes the stars when first asked, collective; None for linear cells
 
     @property
     def states(self) -> int:

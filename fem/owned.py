@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import psutil
 
-from softgrasp.fem.errors import SceneError, agree
+from softgrasp.fem.errors import SceneError, agree, no_pipe
 
 if TYPE_CHECKING:  # pages are written without MPI
     from mpi4py import MPI
@@ -112,13 +112,12 @@ def follow(folder: Path) -> None:
 def _check_ended(folder: Path, lock: Path) -> None:
     """Raises SceneError: the process that a lock names runs, or may run."""
     try:
-        holder = Process(**json.loads(lock.read_text()))
-        ended = holder.ended()
-    except (OSError, ValueError, TypeError):
+        holder = Process(**json.loads(no_pipe(lock).read_text()))
+        name, ended = holder.host.split()[0], holder.ended()
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
         raise SceneError(f"--out {folder}: its lock {lock} is damaged; remove it if no run writes there") from None
     if ended or holder == Process.own():
         return
-    name = holder.host.split()[0]
     if holder.host == Process.own().host:
         raise SceneError(
             f"--out {folder}: process {holder.pid} runs in this folder; name another folder, or wait for its end"

@@ -100,7 +100,7 @@ def times_columns(A: PETSc.Mat, X: Array) -> Array:
     On one rank X stored by rows, or of eight columns and more with few entries, goes by SciPy's product, for which the
     matrix keeps a copy, and other X by PETSc's in blocks; on more ranks all columns go at once, since every block costs
     messages. One or two columns, and a rank without rows, on which PETSc's product crashes, go by the product with
-    vectors. ``python -m benchmarks switches --switches product`` measures the ways.
+    vectors. Times of the ways: docs/benchmarks.md.
     """
     k, serial, entries = X.shape[1], A.comm.size == 1, A.getType() != PETSc.Mat.Type.PYTHON
     few = k >= BLOCK_COLUMNS and X.size <= FEW_ENTRIES

@@ -29,10 +29,10 @@ Method = Literal["auto", "dense", "newton_adi", "radi", "galerkin"]
 METHODS: tuple[Method, ...] = get_args(Method)
 Spelling = Method | Literal["newton-adi"]  # as in scenes
 # Exact to rounding, without a start or shifts that could fail, and still as fast as low rank within some tenths of a
-# second; the faster one of the two changes between 92 and 160 states (benchmarks.switches).
+# second; the faster one of the two changes between 92 and 160 states (docs/benchmarks.md).
 DENSE_STATES = 200
 # A complex factorisation a shift: beyond these sizes 70 to 100 of them take more than a quarter of an hour on two ranks
-# (benchmarks.switches --large times one), while Galerkin needs about 5.
+# (docs/benchmarks.md), while Galerkin needs about 5.
 LOW_RANK_LIMIT = {1: 800_000, 2: 800_000, 3: 40_000}  # 1: systems without a mesh
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
-from softgrasp.fem.errors import agree
+from softgrasp.fem.errors import agree, no_pipe
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.owned import note
@@ -27,7 +27,9 @@ from softgrasp.reduction.operators import Reconstruction
 if TYPE_CHECKING:
     from softgrasp.reduction.strain.model import StrainModel
 
-LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 2"
+LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 3"
+# what h5py and the reading of a model raise of a file that is not whole
+DAMAGE = (OSError, LookupError, TypeError, ValueError, RuntimeError, AttributeError, MemoryError)
 CHECKSUMS = ("sha256", "sha256_lift")  # attributes: of everything but the reconstruction, and of the reconstruction
 ROWS = 1 << 16  # rows of the reconstruction read at a time: 30 MB for 60 columns
 # what a file says of a model in JSON, beside its materials and the names of its outputs
@@ -43,6 +45,7 @@ STRAIN_ARRAYS = {
     "box": ("lam", "mu", "load", "reach"),
     "parts": ("K_mu", "K_lambda", "G"),
 }
+FINER_ARRAYS = ("K_mu", "K_lambda", "G", "gram")
 
 
 def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
@@ -91,6 +94,9 @@ def write_small(model: ReducedModel | StrainModel, file: h5py.File) -> None:
             group: {key: getattr(model if group == "parts" else getattr(model, group), key) for key in keys}
             for group, keys in STRAIN_ARRAYS.items()
         }
+        if model.finer is not None:
+            groups["finer"] = {key: getattr(model.finer, key) for key in FINER_ARRAYS}
+            groups["finer/cells"] = {key: getattr(model.finer.cells, key) for key in STRAIN_ARRAYS["cells"]}
     for group, arrays in groups.items():
         for key, value in arrays.items():
             file[f"{group}/{key}"] = value
@@ -132,14 +138,20 @@ def read_linear(file: h5py.File, data: dict[str, Any], layout: BlockLayout | Non
 def read_strain(file: h5py.File, data: dict[str, Any], layout: BlockLayout | None) -> StrainModel:
     """The same at finite strain."""
     from softgrasp.reduction.strain.cells import Cells  # only scenes with finite strain pay for it
+    from softgrasp.reduction.strain.indicator import Finer
     from softgrasp.reduction.strain.model import StrainModel, TrainedBox
 
     cells, box, parts = ({key: file[f"{group}/{key}"][()] for key in keys} for group, keys in STRAIN_ARRAYS.items())
     shared, law = _read_shared(file, data), data.pop("law")
     Phi = None if layout is None else np.asarray(read_reconstruction(file, layout).L_q)
+    finer = None
+    if "finer" in file:
+        sampled = Cells(law, **{key: file[f"finer/cells/{key}"][()] for key in STRAIN_ARRAYS["cells"]})
+        finer = Finer(sampled, **{key: file[f"finer/{key}"][()] for key in FINER_ARRAYS})
     return StrainModel(
-        cells=Cells(law, **cells), box=TrainedBox(**box), **parts, **shared, **data, layout=layout, Phi=Phi
-    )
+        cells=Cells(law, **cells), box=TrainedBox(**box), **parts, **shared, **data, layout=layout, Phi=Phi,
+        finer=finer,
+    )  # fmt: skip
 
 
 def _read_shared(file: h5py.File, data: dict[str, Any]) -> dict[str, Any]:
@@ -196,7 +208,7 @@ def reading(
     comm = MPI.COMM_SELF if layout is None else layout.comm
     with agree(comm):
         try:
-            with h5py.File(path, "r") as file:
+            with h5py.File(no_pipe(path), "r") as file:
                 if file.attrs.get("format") not in (LINEAR, STRAIN):
                     raise ModelError(f"{path} is no reduced model of this version ({LINEAR!r}); reduce the scene again")
                 # one rank reads a reconstruction twice, not all of them
@@ -208,7 +220,7 @@ def reading(
                     other = about["scene_hash"][:12]
                     raise ModelError(f"{path} was made for another scene (hash {other}); reduce the scene again")
                 yield file, about
-        except (OSError, KeyError, TypeError, ValueError) as error:
+        except DAMAGE as error:
             reason = f"{error} is missing" if isinstance(error, KeyError) else error
             raise ModelError(f"{path} cannot be read as a reduced model ({reason}); reduce the scene again") from error
 

@@ -226,7 +226,10 @@ class ReducedModel:
             raise ModelError(f"{len(materials)} materials are given; the model has {len(self.materials)} layers")
         for m in materials:
             if not (m.mu > 0 and m.lam > -2 * m.mu / 3 and m.rho > 0 and m.beta >= 0):
-                raise ModelError(f"{m} is no elastic material; mu, rho must be > 0, lambda > -2 mu / 3 and beta >= 0")
+                raise ModelError(
+                    f"lambda = {m.lam:g} Pa, mu = {m.mu:g} Pa, rho = {m.rho:g} kg/m3, beta = {m.beta:g} s is no "
+                    "elastic material; mu and rho must be > 0, lambda > -2 mu / 3 and beta >= 0"
+                )
         if not self.damped and any(m.beta > 0 for m in materials):
             raise ModelError("beta > 0 needs a model projected with effects.damping; name it in the scene")
         scale = 1.0

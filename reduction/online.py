@@ -12,7 +12,7 @@ from softgrasp.reduction.model import ModelError, SmallModel, UnstableModelError
 from softgrasp.reduction.propagator import Propagator, march, march_together, propagator
 
 # byte of the matrices of a batch up to which all models step together; somewhere between 4 and 11 MB they leave the
-# cache, and one model after the other is faster (benchmarks.switches)
+# cache, and one model after the other is faster (docs/benchmarks.md)
 TOGETHER = 5_000_000
 
 

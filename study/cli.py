@@ -20,6 +20,7 @@ from softgrasp.study.shell.folder import default_folder
 from softgrasp.study.shell.options import parse_tolerance, takes
 
 LIST_WIDTH = 200  # [letters]
+FOREIGN = 5  # files that a list of runs leaves out by name
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
@@ -103,7 +104,12 @@ def list_runs(folder: Annotated[Path, typer.Argument(help="folder that the runs 
     if rank() == 0:
         wide = console()
         wide.width = max(wide.width, LIST_WIDTH)  # a narrower terminal breaks the lines, but loses nothing
-        wide.print(runs_below(folder).terminal())
+        runs, foreign = runs_below(folder)
+        wide.print(runs.terminal())
+        for file in foreign[:FOREIGN]:
+            wide.print(f"left out: {file} is damaged or not of softgrasp", soft_wrap=True, markup=False)
+        if len(foreign) > FOREIGN:
+            wide.print(f"and {len(foreign) - FOREIGN} more")
 
 
 @app.command()
@@ -271,17 +277,25 @@ def query(
 
 
 @app.command()
-@takes("scene out set_ quiet pictures gain_only empty pdf")
+@takes("scene out set_ quiet pictures gain_only retune empty pdf")
 def control(
     gain_only: Annotated[
         bool, typer.Option("--gain-only", help="only the Riccati equation and the controllers: no loop, no pictures")
+    ] = False,
+    retune: Annotated[
+        bool,
+        typer.Option(
+            "--retune",
+            help="also re-tune gains at nine materials over reduction.lambda_range and mu_range, each against a full "
+            "Riccati equation of its own: many times the work",
+        ),
     ] = False,
     **shared: Any,
 ) -> None:
     """Design the optimal feedback of a scene, reduce it and close the loop; also under `mpiexec -n N`."""
     from softgrasp.study.control.run import run_control
 
-    _run(run_control, gain_only=gain_only, **shared)
+    _run(run_control, gain_only=gain_only, retune=retune, **shared)
 
 
 @app.command()
@@ -297,7 +311,7 @@ def study(
     question: Annotated[
         list[str] | None,
         typer.Option(
-            help="only this question: forward, reduced, bases, riccati, reduced_riccati or loop; several with commas"
+            help="only this question: forward, reduced, bases, riccati or reduced_riccati; several with commas"
         ),
     ] = None,
     **shared: Any,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import re
@@ -205,6 +206,20 @@ def test_pages_build_strictly(tmp_path: Path) -> None:
     api = (tmp_path / "site" / "api.html").read_text()
     assert (tmp_path / "site" / "tutorials" / "forward.ipynb").stat().st_size > 1000
     assert all(f"sg.{name}" in api or f">{name}<" in api for name in sg.__all__), "api.md lacks a name of the face"
+
+
+def test_limits_of_the_page_of_costs_are_those_of_the_source() -> None:
+    """Name and value, as in `reduction.online.TOGETHER`, 5 MB; of a dictionary the values in 2D and 3D."""
+    rows = re.findall(
+        r"^\| `((?:fem|reduction|lqr)[\w.]+\.[A-Z_]+)`, ([^|]+) \|", (ROOT / "docs/benchmarks.md").read_text(), re.M
+    )
+    assert len(rows) >= 7
+    for name, text in rows:
+        module, constant = name.rsplit(".", 1)
+        value = getattr(importlib.import_module(f"softgrasp.{module}"), constant)
+        told = text.replace(" MB", "000000").replace(" 000", "000").replace("131 072", "131072")
+        numbers = [int(word) for word in re.findall(r"(?<![\w])\d+(?!D)", told)]
+        assert numbers == ([value] if isinstance(value, int) else [value[d] for d in (2, 3) if f"{d}D" in text]), name
 
 
 def test_make_targets_of_the_pages_exist() -> None:

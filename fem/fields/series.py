@@ -7,6 +7,7 @@ from pathlib import Path
 import dolfinx.la
 import dolfinx.plot
 import numpy as np
+import numpy.typing as npt
 
 from softgrasp.fem.fields.stress import CellStress
 from softgrasp.fem.fields.vtu import Collection, Field, Grid, write_vtu
@@ -77,8 +78,8 @@ class SeriesWriter:
             on_root(self.comm, self._begin)
         path = self.folder / f"{self.written:06}.vtu"
         check_room(self.comm, [path], needed, reserve)
-        write_vtu(self.comm, path, self.grid, points, cells, whole)
-        on_root(self.comm, lambda: self.list.add(t, path))
+        checks = write_vtu(self.comm, path, self.grid, points, cells, whole)
+        on_root(self.comm, lambda: self.list.add(t, path, checks))
         self.written += 1
 
     def _begin(self) -> None:
@@ -91,15 +92,15 @@ class SeriesWriter:
             return np.asarray(self.model.displacement(z, q_s).x.array.reshape(-1, self.d))
 
         u = of_nodes(z, q_s)
-        strain, stress, mises = (values.astype(np.float32) for values in self.stress(u))
+        strain, stress, mises = (values.astype(np.float32, order="C") for values in self.stress(u))
         cells = [Field("strain", "1", strain), Field("stress", "Pa", stress), Field("von_mises", "Pa", mises)]
         points = [Field("displacement", "m", self._points(u))]
         if v_s is not None:
             points.append(Field("velocity", "m/s", self._points(of_nodes(v, v_s))))
         return [*points, self.held], [*cells, self.layer]
 
-    def _points(self, values: Array) -> Array:
-        """Rows of the points of the grid, with three components."""
-        rows = np.zeros((len(self.used), 3))
+    def _points(self, values: Array) -> npt.NDArray[np.float32]:
+        """Rows of the points of the grid, with three components, in single precision as the fields of the cells."""
+        rows = np.zeros((len(self.used), 3), dtype=np.float32)
         rows[:, : self.d] = values[self.used]
         return rows

@@ -11,7 +11,7 @@ import numpy as np
 
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.strain.laws import LAWS
+from softgrasp.fem.strain.laws import LAWS, volume_change
 
 VOIGT = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 
@@ -27,32 +27,48 @@ class CellStress:
 
     def __init__(self, model: Model) -> None:
         space, d = model.space, model.space.mesh.dimension
-        self.gradients = space.gradients(np.full((1, d), 1 / (d + 1)))[:, 0].transpose(0, 2, 1)  # (m, d, k)
-        self.dofs = space.V.dofmap.list[: space.mesh.owned]
+        self.d = d
+        gradients = space.gradients(np.full((1, d), 1 / (d + 1)))[:, 0]  # (m, k, d)
+        self.gradients = np.ascontiguousarray(gradients.transpose(1, 2, 0))  # a row of cells for each component
+        self.dofs = np.ascontiguousarray(space.V.dofmap.list[: space.mesh.owned].T)  # (k, m)
         self.layer = space.layer.astype(np.int32)
         finite = model.scene.effects.finite_strain
         self.law = None if finite is None else LAWS[finite.law]
-        self.lam, self.mu = (np.array([getattr(m, key) for m in model.system.materials]) for key in ("lam", "mu"))
+        materials = model.system.materials
+        self.lam, self.mu = (np.array([getattr(m, key) for m in materials])[self.layer] for key in ("lam", "mu"))
 
     def __call__(self, u: Array) -> tuple[Array, Array, Array]:
         """Strain [1] (m, 6), stress [Pa] (m, 6), both as xx, yy, zz, xy, yz, xz, and von Mises stress [Pa] (m,).
 
         ``u``: displacement of the local nodes, ghosts included [m], shape (n, d).
         """
-        d = u.shape[1]
-        H = np.zeros((len(self.dofs), 3, 3))
-        H[:, :d, :d] = (self.gradients @ u[self.dofs]).transpose(0, 2, 1)  # H_ij = d u_i / d x_j
-        lam, mu = self.lam[self.layer], self.mu[self.layer]
-        eps = (H + H.transpose(0, 2, 1)) / 2
+        d, lam, mu = self.d, self.lam, self.mu
+        H = np.zeros((3, 3, self.dofs.shape[1]))  # H_ij = d u_i / d x_j, a row of cells each
+        for i in range(d):
+            at = np.ascontiguousarray(u[:, i])[self.dofs]
+            for j in range(d):
+                np.einsum("km,km->m", self.gradients[:, j], at, out=H[i, j])
+        own = [c for c, (i, j) in enumerate(VOIGT) if max(i, j) < d]  # the others are zero
+        eps, sigma = np.zeros((6, len(lam))), np.zeros((6, len(lam)))
+        for c in own:
+            i, j = VOIGT[c]
+            eps[c] = H[i, j] if i == j else (H[i, j] + H[j, i]) / 2
         if self.law is None:
-            sigma = 2 * mu[:, None, None] * eps + (lam * np.trace(eps, axis1=1, axis2=2))[:, None, None] * np.eye(3)
+            for c in own:
+                sigma[c] = 2 * mu * eps[c]
+            sigma[:3] += lam * (eps[0] + eps[1] + eps[2])
         else:
-            F = np.eye(3) + H
+            F = np.eye(3)[:, :, None] + H
             with np.errstate(invalid="ignore", divide="ignore"):  # J <= 0 at the midpoint of a cell has no stress
-                P = self.law.stress(np.ascontiguousarray(H.transpose(1, 2, 0)), lam, mu).transpose(2, 0, 1)
-                sigma = P @ F.transpose(0, 2, 1) / np.linalg.det(F)[:, None, None]
-            eps += H.transpose(0, 2, 1) @ H / 2
-        shear = sigma - np.trace(sigma, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
-        mises = np.sqrt(1.5 * np.einsum("cij,cij->c", shear, shear))
-        rows, columns = zip(*VOIGT, strict=True)
-        return eps[:, rows, columns], sigma[:, rows, columns], mises
+                P, J = self.law.stress(H, lam, mu), 1 + volume_change(H)
+                for c, (i, j) in enumerate(VOIGT):
+                    sigma[c] = (P[i] * F[j]).sum(axis=0) / J
+            for c in own:
+                i, j = VOIGT[c]
+                eps[c] += (H[:, i] * H[:, j]).sum(axis=0) / 2
+        shear = sigma[:3] - (sigma[0] + sigma[1] + sigma[2]) / 3
+        squares = shear[0] ** 2 + shear[1] ** 2 + shear[2] ** 2
+        for c in own[d:]:
+            squares += 2 * sigma[c] ** 2
+        mises = np.sqrt(1.5 * squares)
+        return eps.T, sigma.T, mises

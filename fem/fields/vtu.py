@@ -5,6 +5,8 @@ ParaView, PyVista, VisIt and meshio read them; the numbers stand behind the XML,
 
 from __future__ import annotations
 
+import re
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,12 +14,13 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from softgrasp.fem.errors import agree
+from softgrasp.fem.errors import agree, no_pipe
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array, on_root
 
 HEAD = '<?xml version="1.0"?>\n<VTKFile type="{}" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
 TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "u1": "UInt8"}
+ENTRY = re.compile(r'(<DataSet timestep="(.*?)" part="0" file="(.*?)"/>)<!--(\S*) (.*)-->')
 TENSOR = ("xx", "yy", "zz", "xy", "yz", "xz")  # the order of a symmetric tensor in VTK
 
 
@@ -69,8 +72,8 @@ class Grid:
 
 def write_vtu(
     comm: MPI.Intracomm, path: Path, grid: Grid, points: list[Field], cells: list[Field], whole: list[Field]
-) -> None:
-    """Write one file, in which each rank's grid is a piece. Collective.
+) -> str:
+    """Write one file, in which each rank's grid is a piece; its checksum on rank 0. Collective.
 
     Args:
         points, cells: fields of this rank, one row a point or a cell.
@@ -95,8 +98,10 @@ def write_vtu(
         ).encode()
     begin, length = comm.bcast(len(head)), len(shared) + comm.allreduce(len(own))
     contents = [(begin + start, own)]
+    first, last = head + shared, b"\n</AppendedData>\n</VTKFile>\n"
+    checks = comm.gather(_check(own))
     if comm.rank == 0:
-        contents += [(0, head + shared), (begin + length, b"\n</AppendedData>\n</VTKFile>\n")]
+        contents += [(0, first), (begin + length, last)]
     on_root(comm, lambda: _begin(path))
     try:
         file = MPI.File.Open(comm, str(path), MPI.MODE_CREATE | MPI.MODE_WRONLY)
@@ -108,6 +113,12 @@ def write_vtu(
             file.Close()
     except MPI.Exception as error:
         raise OSError(f"{path}: {error}") from error
+    return " ".join([_check(first), *(checks or ()), _check(last)])
+
+
+def _check(part: bytes) -> str:
+    """Length and CRC-32 of a part of a file."""
+    return f"{len(part)}:{zlib.crc32(part):08x}"
 
 
 def _begin(path: Path) -> None:
@@ -136,16 +147,43 @@ class Collection:
     END = b"</Collection>\n</VTKFile>\n"
 
     def __init__(self, path: Path, remark: str) -> None:
-        self.path = path
+        self.path, self.last = path, ""  # checksum of the line before
         note(path)
         path.write_bytes(f"{HEAD.format('Collection')}<!--{remark}-->\n<Collection>\n".encode() + self.END)
 
-    def add(self, t: float, file: Path) -> None:
-        """Append the file of an instant t [s]."""
+    def add(self, t: float, file: Path, checks: str) -> None:
+        """Append the file of an instant t [s] with its checksum, which stands in a remark behind it."""
         with self.path.open("r+b") as stream:
             stream.seek(-len(self.END), 2)
-            line = f'<DataSet timestep="{float(t)!r}" part="0" file="{file.relative_to(self.path.parent)}"/>\n'
-            stream.write(line.encode() + self.END)
+            line = f'<DataSet timestep="{float(t)!r}" part="0" file="{file.relative_to(self.path.parent)}"/>'
+            self.last = _check(f"{self.last}{line}{checks}".encode())
+            stream.write(f"{line}<!--{self.last} {checks}-->\n".encode() + self.END)
+
+    @classmethod
+    def read(cls, path: Path) -> list[tuple[float, Path, str]]:
+        """Times [s], files and their checksums. Raises OSError, ValueError: it cannot be read, or is damaged."""
+        with path.open("rb") as stream:
+            data = stream.read()
+        entries, last = [], ""
+        if not data.startswith(HEAD.format("Collection").encode()) or not data.endswith(cls.END):
+            raise ValueError("it is not whole")
+        for line in data.removesuffix(cls.END).decode().splitlines()[4:]:
+            found = ENTRY.fullmatch(line)
+            if found is None or _check(f"{last}{found[1]}{found[5]}".encode()) != found[4]:
+                raise ValueError("a line is not what was written")
+            last = found[4]
+            entries.append((float(found[2]), path.parent / found[3], found[5]))
+        return entries
+
+
+def check_file(path: Path, checks: str) -> None:
+    """Compare a file with its checksum. Raises OSError, ValueError: it cannot be read, or is damaged."""
+    with no_pipe(path).open("rb") as stream:
+        for check in checks.split():
+            if _check(stream.read(int(check.partition(":")[0]))) != check:
+                raise ValueError("it is not what was written")
+        if stream.read(1):
+            raise ValueError("it is longer than what was written")
 
 
 def note_of(path: Path) -> str:

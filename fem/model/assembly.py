@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import basix
@@ -17,6 +18,7 @@ from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import BlockLayout, bounding_box
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
+from softgrasp.fem.model.patches import make_patches
 from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.scene.scene import FiniteStrain, Scene
 from softgrasp.fem.system import Component, LayerBlocks
@@ -104,6 +106,7 @@ def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
         reference=reference,
         extent=float((high - low).max()) or 1.0,
         held=np.ascontiguousarray(X[contact, :d]),
+        patches=cache(partial(make_patches, V, free)) if scene.tissue.order > 1 else None,
     )
     return Discretisation(mesh, V, contact, free, is_e, R, layout, *layer_numbers(mesh, scene))
 

@@ -12,7 +12,7 @@ from softgrasp.fem.errors import ResourceError, shortened
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.resources import free_memory
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.solve.solvers import choose_solver, factor_on_every_rank
+from softgrasp.fem.solve.solvers import ITERATIVE, choose_solver, factor_on_every_rank
 
 # Peak of mesh, forms and matrices, those of a step included [byte a cell], by dimension and order, measured on boxes
 # of 5e4 to 7e5 simplices; then what each layer adds. With the factor they give 0.8 to 1.04 of what was measured. Order
@@ -45,7 +45,7 @@ def factor_bytes(name: str, n: int, dimension: int, copies: int) -> float:
     nnz(L) / n = 7.75 log2 n - 44 in 2D and 19.5 n^(1/3) - 85 in 3D, fitted to regular simplex meshes of 1e3 to 4e6
     (2D) and 5e2 to 2e5 (3D) unknowns; 8 byte an entry and 4 an index, of which cholesky has one for d^2 entries.
     """
-    if name == "cg" or n < 2:
+    if name in ITERATIVE or n < 2:
         return 0.0
     row = 7.75 * np.log2(n) - 44 if dimension == 2 else 19.5 * n ** (1 / 3) - 85
     entry = 8 + (4 / dimension**2 if name == "cholesky" else 4)

@@ -85,7 +85,7 @@ def measure_sag(model: Model, a: Array) -> tuple[Sag, Gradient]:
         g = np.eye(layout.n_s)[d - 1] * -EARTH
     columns, (solver, _) = system.G @ np.column_stack([g, load]), choose_solver(layout, scene.time.solver, few=True)
     where, repeat = "the static equilibrium", scene.time.reproducible
-    Z = static_columns(system, columns, where, scene.time.rtol, solver=solver, reproducible=repeat)
+    Z = static_columns(system, columns, where, solver=solver, reproducible=repeat)
     largest = float(np.linalg.norm(Z[:, 0].reshape(-1, d), axis=1).max(initial=0.0))
     sag = Sag(tuple(g[:d].tolist()), max(layout.comm.allgather(largest)), gradient(model, Z[:, 0]))
     return sag, gradient(model, Z[:, 1])

@@ -26,7 +26,7 @@ from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 
-FORMAT = 5
+FORMAT = 6
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # what a run shows and keeps, not what it computes
 FREE = ("name", "description", "reduction", "study")
 OLD = ("*step*-rank*", "*frame*.npz")  # patterns of the files that a new manifest makes useless
@@ -52,8 +52,8 @@ class RestartState:
     energies: Array  # dissipated, at the start, largest [J]
     residual_first: float  # relative, of the first solve
     forces: Array | None = None  # on the hand so far, (n, n_s); None where the motion is prescribed
-    newton_rows: Array | None = None  # with ``newton_numbers`` what the iterations of finite strain remember, or None
-    newton_numbers: Array | None = None
+    solver_rows: Array | None = None  # vectors that the iterations of finite strain or of a solver remember, or None
+    solver_numbers: Array | None = None  # numbers that they remember, or None
 
     def arrays(self) -> dict[str, Any]:
         """What goes into this rank's file, by its name there."""

@@ -23,6 +23,7 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, combine, led, total
 from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState, viscosity
+from softgrasp.fem.solve.solvers import ITERATIVE
 from softgrasp.fem.strain.body import Body
 from softgrasp.fem.strain.newton import Counts, NewtonFigures, Pairs, QuasiNewton, Root
 from softgrasp.fem.strain.points import whole_points
@@ -82,7 +83,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
     now: TissueState  # where the step in work begins
 
     def _price(self) -> float:
-        if self.solver.name == "cg":
+        if self.solver.name in ITERATIVE:
             return 8.0
         nz = self.solver.ksp.getPC().getFactorMatrix().getInfo()["nz_used"]
         return float(np.clip(nz / (4 * self.system.layout.n_e), 8, 100))
@@ -140,7 +141,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         rows = [self.operators.leave(x) for x in (*tangent, *self.past, *pairs.dx, *pairs.dr)]
         sizes = [len(tangent), len(self.past), len(pairs.order), pairs.order[-1] if pairs.order else 0]
         numbers = np.array([*sizes, *vars(self.counts).values()], dtype=float)
-        return {"newton_rows": np.array(rows).reshape(len(rows), len(self.r_array)), "newton_numbers": numbers}
+        return {"solver_rows": np.array(rows).reshape(len(rows), len(self.r_array)), "solver_numbers": numbers}
 
     def recall(self, rows: Array | None, numbers: Array | None) -> None:
         """Take over what :meth:`memory` gave, after :meth:`join`. Collective."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.inexact import InexactMidpoint
 from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState
 from softgrasp.fem.system import BlockSystem
 
@@ -35,17 +36,19 @@ class HandStep:
         self.g, self.weight, self.alpha = system.fall, system.weight, system.damping.drag
         self.kappa = 1 + self.alpha * self.dt / 2
         self.theta = self.s**2 + self.alpha * self.s
+        self.inexact = midpoint if isinstance(midpoint, InexactMidpoint) else None
         self.GY, L = np.zeros(system.M_hand.shape), system.M_hand
         finite = system.two_way and system.points is not None
         if system.two_way or responses:
             self.Y = midpoint.make_responses()  # which the midpoint keeps: corrections of finite strain need it
         if system.two_way:
             GY = total(self.comm, system.G.T @ self.Y)
-            self.GY = (GY + GY.T) / 2
+            self.GY = GY if self.inexact else (GY + GY.T) / 2
             L = system.M_hand + self.kappa * (system.M_rigid - (0.0 if finite else self.theta * self.GY))
         self.inverse = np.linalg.inv(L)
         # chosen once, not in every step
-        self.push = self._finite if finite else self._two_way if system.two_way else self._one_way
+        two_way = self._inexact if self.inexact else self._two_way
+        self.push = self._finite if finite else two_way if system.two_way else self._one_way
 
     def _one_way(self, v: Array, u: Array, state: TissueState) -> Array:
         """Solve the tissue under u (n_s,) and the velocity v of the hand; its acceleration. Collective."""
@@ -61,6 +64,21 @@ class HandStep:
         a = self.inverse @ (u + self.weight - system.M_rigid @ c_0 - pull)
         self.midpoint.accelerate(self.kappa * a + c_0)
         return np.asarray(a)
+
+    def _inexact(self, v: Array, u: Array, state: TissueState) -> Array:
+        """As `_two_way`, where w is scaled so that its residual does no work. Collective."""
+        system, c_0 = self.system, self.alpha * v - self.g
+        assert self.inexact is not None
+        known = np.column_stack([self.inexact.respond(), state.array[system.layout.n_local :]])
+        pull, momentum = total(self.comm, system.G.T @ known).T
+        return self.inexact.push_hand(
+            system.M_hand + self.kappa * system.M_rigid,
+            self.kappa * self.theta * self.GY,
+            u + self.weight - system.M_rigid @ c_0 + self.s * momentum,
+            self.theta * (pull - self.GY @ c_0),
+            self.kappa,
+            c_0,
+        )
 
     def _finite(self, v: Array, u: Array, state: TissueState) -> Array:
         """The hand's equation is part of the tissue's. Collective."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from softgrasp.fem.run.inexact import InexactMidpoint
 from softgrasp.fem.run.midpoint import TissueMidpoint
-from softgrasp.fem.solve.solvers import Reproducible, SolverName
+from softgrasp.fem.solve.solvers import ITERATIVE, Reproducible, SolverName
 from softgrasp.fem.system import BlockSystem
 
 
@@ -11,6 +12,8 @@ def make_midpoint(
     system: BlockSystem, dt: float, solver: SolverName, rtol: float = 1e-10, reproducible: Reproducible = "auto"
 ) -> TissueMidpoint:
     """The step of a system, linear or of finite strain; arguments as for `TissueMidpoint`. Collective."""
+    if system.points is None and solver in ITERATIVE:
+        return InexactMidpoint(system, dt, solver, rtol, reproducible)
     if system.points is None:
         return TissueMidpoint(system, dt, solver, rtol, reproducible)
     from softgrasp.fem.run.finite_strain import FiniteStrainMidpoint  # only scenes with finite strain pay for it

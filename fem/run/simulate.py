@@ -29,6 +29,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
 
+FRAMES, LIGHT, FEWEST = 60, 100_000, 10  # frames up to so many unknowns, and the fewest of larger bodies
 Observer = Callable[["Run"], None]
 """Called between segments and at every frame; collective, may raise to end the run."""
 
@@ -44,6 +45,7 @@ class RunOptions:
     frame: Observer | None = None  # called with it at the start, at the end and at ``output.frames`` steps between
     begin: Observer | None = None  # called with it once before the first step, when a checkpoint has been read
     keep: Observer | None = None  # called with it before every checkpoint, to add files to :attr:`Run.beside`
+    few: int | None = None  # states kept in memory with output.snapshots = "auto", equally spaced; None keeps all
 
 
 class Run(Stepped):
@@ -67,7 +69,7 @@ class Run(Stepped):
             midpoint = make_midpoint(system, dt, name, scene.time.rtol, scene.time.reproducible)
         self.name: str = system.layout.comm.bcast(secrets.token_hex(6))
         kept, fresh = scene.output, None if options.resume else self.name
-        store = make_store(system, kept.snapshots, scene.time.steps, kept.every, options.directory, fresh)
+        store = make_store(system, kept.snapshots, scene.time.steps, kept.every, options.directory, fresh, options.few)
         super().__init__(system.layout, dt, scene.time.steps, midpoint, store, midpoint.solver.used(reason))
         self.outputs: tuple[Output, ...] = make_outputs(scene, system)
         self.local_outputs = np.zeros((self.steps + 1, sum(o.size for o in self.outputs)))
@@ -228,7 +230,7 @@ class Run(Stepped):
         for vector in (self.state.z, self.state.v, midpoint.r):
             vector.stateIncrease()
         midpoint.join(self.state)
-        midpoint.recall(saved.newton_rows, saved.newton_numbers)
+        midpoint.recall(saved.solver_rows, saved.solver_numbers)
 
     def trajectory(self) -> Trajectory:
         """Gather the small results; the tissue stays distributed. Collective."""
@@ -259,10 +261,16 @@ class Run(Stepped):
         )
 
 
-def frame_steps(scene: Scene) -> list[int]:
-    """Steps at which ``RunOptions.frame`` is called: ``output.frames`` intervals from start to end."""
+def frame_count(scene: Scene, n_e: int) -> int:
+    """Intervals between frames: ``output.frames``, or by size what a body of `LIGHT` unknowns fills with `FRAMES`."""
+    frames = scene.output.frames
+    return int(np.clip(FRAMES * LIGHT / n_e, FEWEST, FRAMES)) if frames == "auto" else frames
+
+
+def frame_steps(scene: Scene, n_e: int) -> list[int]:
+    """Steps at which ``RunOptions.frame`` is called, from start to end, with n_e unknowns of the tissue."""
     steps = scene.time.steps
-    return np.linspace(0, steps, min(scene.output.frames, steps) + 1).round().astype(int).tolist()
+    return np.linspace(0, steps, min(frame_count(scene, n_e), steps) + 1).round().astype(int).tolist()
 
 
 def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set[int]]:
@@ -273,7 +281,7 @@ def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set
     scene = run.model.scene
     frames: set[int] = set()
     if options.frame is not None:
-        frames = set(frame_steps(scene))
+        frames = set(frame_steps(scene, run.layout.n_e))
     every = scene.output.checkpoint_every
     checkpoints = set(range(every, run.steps, every)) if every else set()
     last = run.steps if options.until is None else min(options.until, run.steps)

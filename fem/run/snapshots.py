@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from softgrasp.fem.errors import CheckpointError, ResourceError, agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.resources import check_room, free_memory
+from softgrasp.fem.resources import MARGIN, check_room, free_memory
 from softgrasp.fem.run.midpoint import TissueState, state_on
 from softgrasp.fem.system import BlockSystem
 
@@ -78,15 +79,18 @@ class NoStore:
 
 
 class MemoryStore(NoStore):
-    """Every k-th state is a column of one local array; the step writes straight into it.
+    """Every k-th state, or ``few`` of these, is a column of one local array; the step writes straight into it.
 
     Raises ResourceError: the columns of all ranks would not fit in the memory that is free now.
     """
 
-    def __init__(self, system: BlockSystem, steps: int, every: int) -> None:
+    def __init__(self, system: BlockSystem, steps: int, every: int, few: int | None = None) -> None:
         super().__init__(system)
         layout = system.layout
-        count = steps // every + 1
+        self.steps = np.arange(0, steps + 1, every)
+        if few is not None:
+            self.steps = self.steps[spread(len(self.steps), few)]
+        count = len(self.steps)
         needed = 16 * layout.n_e * count
         free = layout.comm.bcast(free_memory())
         if needed > 0.8 * free:
@@ -95,7 +99,6 @@ class MemoryStore(NoStore):
                 f"and {free} are free; set output.every = {every * int(np.ceil(needed / (0.5 * free)))} "
                 "or output.snapshots = 'hdf5'"
             )
-        self.steps = np.arange(0, steps + 1, every)
         self.Z = np.empty((2 * layout.n_local, len(self.steps)), order="F")
         self.Z.fill(0.0)  # touches every page here, not in the time loop
         self.columns = {int(s): state_on(self.Z[:, j], system) for j, s in enumerate(self.steps)}
@@ -109,7 +112,12 @@ class MemoryStore(NoStore):
         return self.Z[:, : int(np.searchsorted(self.steps, step, side="right"))]
 
     def restore(self, columns: Array, step: int, run: str) -> None:
-        """Fill the first columns again."""
+        """Fill the first columns again. Raises CheckpointError: the run before kept others."""
+        if columns.shape[1] != np.searchsorted(self.steps, step, side="right"):
+            raise CheckpointError(
+                f"the restart file holds {columns.shape[1]} states up to step {step}, this run keeps others; resume "
+                "with the command that was stopped, or run again without --resume"
+            )
         self.Z[:, : columns.shape[1]] = columns
 
     def finish(self, times: Array, q: Array, v: Array) -> Snapshots | None:
@@ -190,11 +198,12 @@ class Hdf5Store(NoStore):
             check_room(comm, [self.path], 8 * len(self.buffer) * (end - self.written))
             with agree(comm):
                 try:
+                    _reserve(self.path, 8 * (len(self.buffer) + 1) * (end - self.written) + MARGIN)
                     with h5py.File(self.path, "r+") as file:
                         for j in range(self.written, end):
                             file["Z"][j] = self.buffer[:, j % self.width]
                         file.attrs["written"] = end
-                except OSError as error:
+                except (OSError, RuntimeError) as error:
                     raise ResourceError(f"{self.path} cannot be written ({error}); free the disk") from error
             self.written = end
 
@@ -214,6 +223,8 @@ class Hdf5Store(NoStore):
             )
         try:
             with h5py.File(path) as file:
+                if not file["Z"].fletcher32:
+                    raise ValueError("its numbers have no checksums")
                 for j in range(self.written):
                     file["Z"][j]  # HDF5 compares the checksum of what it reads
         except DAMAGE as error:
@@ -236,7 +247,7 @@ class Hdf5Store(NoStore):
         path, count = self.directory / "snapshots.h5", len(self.steps)
         try:
             note(path)
-            with h5py.File(path, "w") as file:
+            with h5py.File(path.name, "w", driver="core", backing_store=False) as file:  # written by Python
                 for key, part in (("z", 0), ("v", 1)):
                     joined = h5py.VirtualLayout((count, sum(sizes)), dtype="f8")
                     at = 0
@@ -248,14 +259,36 @@ class Hdf5Store(NoStore):
                 file["nodes"] = np.vstack(nodes)
                 file["times"], file["steps"] = times, self.steps
                 file["q_s"], file["v_s"] = q, v
+                file.flush()
+                image = file.id.get_file_image()
+            path.write_bytes(image)
         except OSError as error:
             raise ResourceError(f"{path} cannot be written ({error}); remove it or free the disk") from error
 
 
-def make_store(system: BlockSystem, kind: str, steps: int, every: int, directory: Path, run: str | None) -> NoStore:
-    """Store of a run: memory, hdf5 or none; ``run`` is the name of a new run, None resumes. Collective."""
-    if kind == "memory":
-        return MemoryStore(system, steps, every)
+def _reserve(path: Path, size: int) -> None:
+    """Take room on the disk behind the end of a file: HDF5, which gives back the rest, ends the program without it.
+
+    Raises OSError: there is none, or the user's quota or the limit of a file's size is reached.
+    """
+    with path.open("r+b") as file:
+        os.posix_fallocate(file.fileno(), file.seek(0, os.SEEK_END), size)
+
+
+def spread(count: int, few: int) -> np.ndarray:
+    """Numbers of at most ``few`` of so many columns, equally spaced, first and last included."""
+    return np.unique(np.linspace(0, count - 1, few).round().astype(int))
+
+
+def make_store(
+    system: BlockSystem, kind: str, steps: int, every: int, directory: Path, run: str | None, few: int | None = None
+) -> NoStore:
+    """Store of a run: memory, hdf5 or none; ``run`` is the name of a new run, None resumes. Collective.
+
+    ``few``: states that "auto" keeps; None keeps all.
+    """
+    if kind in ("auto", "memory"):
+        return MemoryStore(system, steps, every, few if kind == "auto" else None)
     if kind == "hdf5":
         return Hdf5Store(system, steps, every, directory, run)
     return NoStore(system)

@@ -118,8 +118,10 @@ class Time(Section):
     start: Literal["rest", "equilibrium"] = Field(
         "rest", description="start undeformed, or in equilibrium under gravity [no unit]"
     )
-    solver: Literal["auto", "cholesky", "mumps", "cg"] = Field("auto", description="linear solver [no unit]")
-    rtol: Annotated[float, Field(gt=0, lt=1)] = Field(1e-10, description="relative tolerance [1], cg only")
+    solver: Literal["auto", "cholesky", "mumps", "cg", "stars"] = Field("auto", description="linear solver [no unit]")
+    rtol: Annotated[float, Field(gt=0, lt=1)] = Field(
+        1e-4, description="relative tolerance [1] of each step with cg or stars; energy is exact at any"
+    )
     reproducible: Literal["auto"] | bool = Field(
         "auto",
         description="equal bits in every run on the same number of ranks: each holds the whole factor [no unit]; "
@@ -130,12 +132,16 @@ class Time(Section):
 class Output(Section):
     """What is kept of a run."""
 
-    snapshots: Literal["memory", "hdf5", "none"] = Field("memory", description="where snapshots go [no unit]")
+    snapshots: Literal["auto", "memory", "hdf5", "none"] = Field(
+        "auto", description="where states go; auto: memory, in `simulate` the few that its warnings look at [no unit]"
+    )
     every: Annotated[int, Field(ge=1)] = Field(1, description="a snapshot every so many steps [1]")
     fields: Literal["vtu", "none"] = Field(
         "vtu", description="field files, a list fields.pvd of VTK's .vtu files, or none [no unit]"
     )
-    frames: Annotated[int, Field(ge=1)] = Field(60, description="frames in field files and animations [1]")
+    frames: Literal["auto"] | Annotated[int, Field(ge=1)] = Field(
+        "auto", description="frames in field files and animations [1]; auto: 60 up to 1e5 unknowns, 10 from 6e5 on"
+    )
     checkpoint_every: Annotated[int, Field(ge=0)] = Field(
         0, description="steps between restart files [1]; 0: only on interrupt"
     )

@@ -13,6 +13,8 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from softgrasp.fem.errors import no_pipe
+
 LARGEST, SMALLEST = 1e50, 1e-50  # squares of areas and of energies stay within double precision
 INTEGER = 2**63  # what TOML, HDF5 and PETSc hold
 DEEPEST = 16  # tables and lists in each other; a scene needs 6
@@ -31,7 +33,7 @@ def read_text(path: Path) -> str:
         OSError: the file cannot be read.
         ValueError: it is too large or no UTF-8 text, as the rest of a sentence about it.
     """
-    with path.open("rb") as file:
+    with no_pipe(path).open("rb") as file:
         data = file.read(BYTES + 1)
     if len(data) > BYTES:
         raise ValueError(f"is larger than {BYTES >> 20} MiB; give a text file")

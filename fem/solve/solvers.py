@@ -18,20 +18,22 @@ from softgrasp.fem.solve.cholesky import (
     factor_blocks,
     make_ksp,
 )
+from softgrasp.fem.solve.stars import Stars, factored
 
-SolverName = Literal["cholesky", "mumps", "cg"]
+SolverName = Literal["cholesky", "mumps", "cg", "stars"]
+ITERATIVE = ("cg", "stars")
 Reproducible = Literal["auto"] | bool
 
 # Largest problem of each solver on two ranks with 24 GiB. PETSc Cholesky in blocks is fastest per solve, but its
 # factorisation is the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back
-# (benchmarks.switches), but not the few solves of an equilibrium or of modes, nor without blocks. Above the last
+# (docs/benchmarks.md), but not the few solves of an equilibrium or of modes, nor without blocks. Above the last
 # limits the factor itself no longer fits.
 CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 20_000}  # 1: systems without a mesh
 FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
 # Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. The price of the same bits in
 # every run: between 1e4 and 5e4 unknowns in 3D steps and factorisation of a spread factor become the faster ones
-# (benchmarks.switches), and each rank needs the memory of the whole factor.
+# (docs/benchmarks.md), and each rank needs the memory of the whole factor.
 REPEATED_LIMIT = {1: 1_000_000, 2: 1_000_000, 3: 150_000}
 REPEATED_RANKS = 4
 # Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,
@@ -71,7 +73,7 @@ def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: 
     ranks = layout.comm.size
     if solver == "cholesky":
         return True
-    if ranks == 1 or solver == "cg":
+    if ranks == 1 or solver in ITERATIVE:
         return False
     if reproducible != "auto":
         return bool(reproducible)
@@ -82,18 +84,21 @@ def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: 
 class TissueSolver:
     """A factored (or preconditioned) symmetric positive definite matrix of the tissue block."""
 
-    name: SolverName  # cholesky, mumps or cg
+    name: SolverName  # who solves
     ksp: PETSc.KSP  # the PETSc solver; its vectors are those of S with mumps and cg only, so call `solve`
     S: PETSc.Mat
     tolerance: float  # relative residual that check accepts
     # what solves without a detour through ``ksp``: the factor that every rank has whole, perhaps in an order of its own
     # (softgrasp.fem.solve.cholesky), or that of one rank; None where the factor is spread or there is none
     factor: PETSc.Mat | OrderedFactor | None = None
+    stars: Stars | None = None  # the preconditioner of stars, which owns S
 
     @property
     def package(self) -> str:
         """Who made the factor, asked of PETSc, or what preconditions the iteration."""
         pc = self.ksp.getPC()
+        if self.stars is not None:
+            return f"stars, {self.stars.package}"
         return str(pc.getType().upper() if self.name == "cg" else PACKAGES[pc.getFactorSolverType()])
 
     def used(self, reason: str) -> SolverUsed:
@@ -161,7 +166,7 @@ class TissueSolver:
                 f"{self.name}: the right-hand side is not finite at {where}; check material, dt and force"
             )
         text = f"relative residual {value:.1e} at {where} exceeds {self.tolerance:.0e}"
-        if self.name != "cg" and np.isfinite(value):
+        if self.name not in ITERATIVE and np.isfinite(value):
             error = self.error(r, w)
             if error <= DIRECT_ERROR:
                 return value
@@ -188,6 +193,9 @@ class TissueSolver:
 
         ``S`` itself keeps its numbers where blocks are factored, and :meth:`check` is of no use afterwards.
         """
+        if self.stars is not None:
+            self.stars.renew(A)
+            return True
         P = self.ksp.getOperators()[0]
         if "sbaij" in P.getType():
             A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -208,7 +216,10 @@ class TissueSolver:
         if isinstance(self.factor, OrderedFactor):
             self.factor.destroy()
         self.ksp.destroy()
-        self.S.destroy()
+        if self.stars is not None:
+            self.stars.destroy()
+        else:
+            self.S.destroy()
 
 
 def make_solver(
@@ -224,8 +235,8 @@ def make_solver(
 
     Args:
         S: symmetric positive definite, owned by the solver from here on.
-        name: cholesky (PETSc, every rank by itself), mumps (see ``reproducible``) or cg (GAMG [VMB96]).
-        rtol: relative tolerance of cg.
+        name: cholesky (PETSc, every rank by itself), mumps (see ``reproducible``) cg (GAMG [VMB96]) or stars.
+        rtol: relative tolerance of cg and stars.
         reproducible: see :func:`factor_on_every_rank`.
         ordered: cholesky, S on one rank: its rows are in the order of elimination already, in blocks (BAIJ).
 
@@ -235,6 +246,8 @@ def make_solver(
     tolerance = max(DIRECT_RESIDUAL, 10 * rtol)
     if name == "cholesky":
         return _cholesky(S, layout, prefix, tolerance, ordered)
+    if name == "stars":
+        return _stars(S, layout, prefix, rtol)
     if name == "mumps" and S.comm.size > 1 and factor_on_every_rank(layout, name, reproducible):
         return _repeated(S, layout, prefix, tolerance)
     ksp = PETSc.KSP().create(S.comm)
@@ -313,6 +326,33 @@ def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
         raise SolverError(f"{name}: set-up failed (reason {reason}); the matrix is not definite")
 
 
+def _stars(S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float) -> TissueSolver:
+    """CG with multigrid over vertex stars; flexible where the linear elements are iterated upon. Collective."""
+    if layout.patches is None:
+        S.destroy()
+        raise SolverError(
+            "stars: linear elements have no stars to smooth over; take tissue.order = 2 or another solver"
+        )
+    ksp = PETSc.KSP().create(S.comm)
+    ksp.setOptionsPrefix(prefix)
+    ksp.setType("cg" if factored(layout) else "fcg")
+    _set_tolerance(ksp, rtol)
+    try:
+        stars = Stars(ksp, S, layout)
+    except (PETSc.Error, np.linalg.LinAlgError) as error:
+        ksp.destroy()
+        raise SolverError(f"stars: the set-up failed ({error}); check material and mesh") from error
+    finally:
+        S.destroy()
+    return TissueSolver("stars", ksp, stars.matrices[0], 10 * rtol, None, stars)
+
+
+def _set_tolerance(ksp: PETSc.KSP, rtol: float) -> None:
+    # the preconditioned norm would stop at a true residual 1e3 times larger
+    ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+    ksp.setTolerances(rtol=rtol, atol=1e-300, max_it=500)
+
+
 def _set_up_cg(ksp: PETSc.KSP, S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float) -> None:
     d = layout.dimension
     coordinates = PETSc.Vec().createWithArray(
@@ -323,9 +363,7 @@ def _set_up_cg(ksp: PETSc.KSP, S: PETSc.Mat, layout: BlockLayout, prefix: str, r
     S.setNearNullSpace(near)
     near.destroy()
     ksp.setType("cg")
-    # the preconditioned norm would stop at a true residual 1e3 times larger
-    ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
-    ksp.setTolerances(rtol=rtol, atol=1e-300, max_it=500)
+    _set_tolerance(ksp, rtol)
     ksp.getPC().setType("gamg")
     with petsc_options(prefix, {"pc_gamg_threshold": 0.01, "mg_levels_ksp_type": "chebyshev"}):
         ksp.setFromOptions()

@@ -23,7 +23,7 @@ def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Tim
 
     Args:
         solver: None takes the one that suits few solves.
-        time: tolerance and reproducibility of the scene.
+        time: for the reproducibility of the scene.
 
     Raises:
         SolverError: the stiffness is singular or the residual too large, or the loads of finite strain do not converge.
@@ -33,8 +33,8 @@ def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Tim
     if system.points is not None:
         return finite_equilibrium(system, solver)
     load, where = (system.G @ system.gravity)[:, None], "the static equilibrium"
-    time = time or Time(steps=1, rtol=1e-12)
-    return static_columns(system, load, where, time.rtol, solver=solver, reproducible=time.reproducible)[:, 0]
+    repeat = "auto" if time is None else time.reproducible
+    return static_columns(system, load, where, solver=solver, reproducible=repeat)[:, 0]
 
 
 def solve_columns(

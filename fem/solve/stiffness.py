@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.solve.solvers import (
+    ITERATIVE,
     Reproducible,
     SolverName,
     TissueSolver,
@@ -31,18 +32,18 @@ def factored_stiffness(
     rtol: float = 1e-12,
     reproducible: Reproducible = "auto",
 ) -> Iterator[TissueSolver]:
-    """K_ee, factored by the first who asks and kept with the system while it is small; of cg its set-up. Collective.
+    """K_ee, factored (or the set-up of cg and stars) by the first who asks, and kept while it is small. Collective.
 
     Args:
         solver: None takes the one that suits few solves.
-        rtol: of cg, where no direct solver fits.
+        rtol: of cg and stars, where no direct solver fits.
 
     Raises SolverError: the factorisation fails.
     """
     layout, K = system.layout, system.K_ee
     name = solver or choose_solver(layout, few=True)[0]
     everywhere = factor_on_every_rank(layout, name, reproducible)
-    key = (K.handle, K.stateGet(), name, everywhere, rtol if name == "cg" else 0.0)
+    key = (K.handle, K.stateGet(), name, everywhere, rtol if name in ITERATIVE else 0.0)
     kept = system.kept.get("factor")
     if kept is not None and kept[0] == key:
         yield kept[1]

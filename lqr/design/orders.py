@@ -20,8 +20,8 @@ from softgrasp.lqr.reduced.bases import A_PRIORI, BASES, BasisFamily, make_famil
 from softgrasp.lqr.reduced.riccati import GainQuality, GainReport
 
 FAST_STATES = 8  # of the tissue, up to which a gain is offered for the control loop and re-tuned: N <= 12 in 2D
-MANY_STATES = 200_000  # above, few orders are tried: every gain is certified by solves with the full plant
-WHOLE_SPECTRUM = 500  # n_e from which the Schur form of all modes for every gain takes seconds, so few orders are tried
+MANY_STATES = 200_000  # above, few orders are tried: every one takes products with the full plant
+WHOLE_SPECTRUM = 500  # n_e from which all eigenvalues for every gain take seconds, so few orders are tried
 FEW_ORDERS = 3
 LONGER = 3  # doublings of a run that has not settled
 
@@ -47,7 +47,7 @@ def fast_order(n_s: int) -> int:
 
 
 def orders(design: Design) -> tuple[list[int], str]:
-    """Orders to try and, where checking a gain takes long, why they are few."""
+    """Orders to try and, where a gain takes long, why they are few."""
     layout, every = design.problem.layout, sorted(set(control_of(design.model).N))
     dense = design.gain_check.loop.complete and layout.n_e > WHOLE_SPECTRUM
     if (layout.states <= MANY_STATES and not dense) or len(every) <= FEW_ORDERS:
@@ -55,14 +55,17 @@ def orders(design: Design) -> tuple[list[int], str]:
     fast = [N for N in every if fast_order(layout.n_s) >= N]
     pick = np.linspace(0, len(every) - 1, FEW_ORDERS).round().astype(int)
     few = sorted({*fast[-1:], *(every[i] for i in pick[1:])})
-    why = "by all its eigenvalues" if dense else "by solves with the full plant"
-    return few, f"{layout.states} states: every gain is certified {why}, so only N = {few} are tried"
+    why = "all eigenvalues" if dense else "products with the full plant"
+    return few, f"{layout.states} states: every gain takes {why}, so only N = {few} are tried"
 
 
 def reduce_gains(
     design: Design, orders: Sequence[int], notify: Notify | None = None, names: Sequence[str] = tuple(BASES)
 ) -> tuple[BasisGains, ...]:
-    """Gains of the reduced Riccati equations over their orders, checked on the full plant. Collective.
+    """Gains of the reduced Riccati equations over their orders, the best of each basis checked on the full plant.
+
+    Collective. The others have their errors, and poles and cost on the modes kept. The a-priori basis has the best of
+    small order checked too: that of the controller.
 
     Args:
         orders: of the reduced equations; those that a basis has not are left out.
@@ -78,11 +81,45 @@ def reduce_gains(
             continue
         reports = []
         for j, N in enumerate(family.orders(orders), 1):
-            reports.append(design.gain_check.report(family.at(N)))
+            reports.append(design.gain_check.first_look(family.at(N)))
             if notify is not None:
                 notify(i * len(orders) + j, len(names) * len(orders))
         bases.append(BasisGains(name, family, tuple(reports)))
-    return tuple(bases)
+    best = certified(design, _ranked(design, bases))
+    n_s = design.problem.layout.n_s
+    offered = range(2 * n_s + 2, fast_order(n_s) + 1)  # to the controller
+    return tuple(certified(design, [b], offered)[0] if b.name == A_PRIORI else b for b in best)
+
+
+def _ranked(design: Design, bases: Sequence[BasisGains]) -> list[BasisGains]:
+    """With the excess cost of every gain on the modes kept. Collective."""
+    gains = [r.gain for b in bases for r in b.reports if r.gain is not None]
+    if not gains:
+        return list(bases)
+    excess = iter(design.gain_check.excesses(gains).tolist())
+
+    def costs(r: GainReport) -> GainReport:
+        own = next(excess) if r.gain is not None else r.cost_excess
+        return replace(r, cost_excess=own if r.promising or r.gain is None else float("inf"))
+
+    return [replace(b, reports=tuple(map(costs, b.reports))) for b in bases]
+
+
+def certified(design: Design, bases: Sequence[BasisGains], sizes: range | None = None) -> list[BasisGains]:
+    """With the full plant asked for the spectrum of the best gain of every basis, or the next best. Collective.
+
+    ``sizes``: orders of the gains that are offered; None for any.
+    """
+    result = []
+    for b in bases:
+        reports = list(b.reports)
+        places = [i for i, r in enumerate(reports) if r.promising and (sizes is None or r.N in sizes)]
+        for i in sorted(places, key=lambda i: (reports[i].cost_excess, reports[i].N)):
+            reports[i] = design.gain_check.examined(reports[i])
+            if reports[i].stable:
+                break
+        result.append(replace(b, reports=tuple(reports)))
+    return result
 
 
 def best_gains(bases: Sequence[BasisGains], layout: BlockLayout) -> list[GainReport]:
@@ -99,7 +136,7 @@ def with_bounds[Figures: GainQuality](
     course: Course,
     notify: Notify | None = None,
 ) -> list[Figures]:
-    """The same with cost and bounds of the loop as it runs, where the gain is stable. Collective.
+    """The same with cost and bounds of the loop as it runs, where nothing rules the gain out. Collective.
 
     See :mod:`softgrasp.lqr.loop.gap`. ``cost_excess_proved`` holds for the run and the optimal feedback after it. What
     the loop's own way costs after that is an allowance in ``cost_excess_at_most``; while it is more than a tenth of the
@@ -109,7 +146,7 @@ def with_bounds[Figures: GainQuality](
         solution: says what is to come after the end of the run; its error does not matter to the bound.
     """
     gains = list(gains)
-    laws: dict[int, Gain] = {i: g.gain for i, g in enumerate(gains) if g.stable and g.gain is not None}
+    laws: dict[int, Gain] = {i: g.gain for i, g in enumerate(gains) if g.promising and g.gain is not None}
     if not laws:
         return gains
     for more in range(LONGER + 1):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.checksums import write_arrays
-from softgrasp.fem.errors import agree
+from softgrasp.fem.errors import agree, no_pipe
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
@@ -257,7 +257,7 @@ def read_npz(path: Path, expected: dict[str, str | None]) -> tuple[dict[str, Any
     Raises ControlError: the file is missing or damaged, or a hash differs.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(no_pipe(path), allow_pickle=False) as file:
             meta: dict[str, Any] = json.loads(str(file["meta"]))
             arrays = {key: np.asarray(file[key]) for key in file.files if key != "meta"}
     except FileNotFoundError:

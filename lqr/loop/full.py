@@ -82,8 +82,8 @@ class ClosedLoop:
     Args:
         problem: plant, outputs and weights.
         dt: time step [s].
-        solver: cholesky, mumps, cg or auto.
-        rtol: tolerance of cg.
+        solver: cholesky, mumps, cg, stars or auto.
+        rtol: tolerance of cg and stars.
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 
     Raises:
@@ -102,7 +102,7 @@ class ClosedLoop:
         problem: RiccatiProblem,
         dt: float,
         solver: str = "auto",
-        rtol: float = 1e-10,
+        rtol: float = 1e-4,
         reproducible: Reproducible = "auto",
     ) -> None:
         if not (np.isfinite(dt) and dt > 0):

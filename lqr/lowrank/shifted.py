@@ -25,7 +25,7 @@ from softgrasp.lqr.plant.checks import MODAL_KEY
 PREFIX = "softgrasp_shifted_"
 # Every rank factors whole matrices up to here, each rank another shift: no messages in the factorisation, and SuperLU
 # in complex numbers is about as fast as MUMPS on the real form of twice the order in 2D, faster in 3D
-# (benchmarks.switches). Beyond, a whole factor on each rank costs too much memory.
+# (docs/benchmarks.md). Beyond, a whole factor on each rank costs too much memory.
 GATHER_LIMIT = {1: 150_000, 2: 150_000, 3: 40_000}  # 1: systems without a mesh
 # n_e up to which SuperLU works column by column in 2D, where it is the faster way; in 3D it needs its panels
 THIN_UP_TO = 20_000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,6 +26,7 @@ from softgrasp.lqr.plant.operators import (
 )
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
+from softgrasp.lqr.reduced.ranking import modal_excess
 from softgrasp.lqr.spectrum.certificate import abscissa
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LoopQuality, ModalLoop, SampledRadius
 from softgrasp.lqr.spectrum.sampled import SampledLoop, Sampling, midpoint_radius
@@ -48,11 +50,12 @@ class GainQuality:
     """A gain against the optimal one, on the full plant; nan where there is none."""
 
     error_K: float = NAN  # noqa: N815  ||K - K_hat||_F / ||K||_F in the paper's coordinates
-    # J(K_hat) / J(K) - 1 from the scene's start: of the continuous law, or with bounds of the loop as it runs
+    # J(K_hat) / J(K) - 1 from the scene's start: on the modes kept, or with bounds of the full loop as it runs
     cost_excess: float = NAN
     abscissa_full: float = NAN  # largest real part of the full closed loop [1/s]
     reason: str = ""  # why there is no gain; empty when there is one
     certified: bool = True  # the sign of the abscissa is certain, see LoopQuality
+    examined: bool = True  # the full plant was asked for its spectrum; else the modes kept alone
     sampled: SampledRadius | None = None  # the loop from tick to tick, where its instants are known
     gain: Gain | None = None  # K_hat; None where there is none
     cost_excess_at_most: float = NAN  # bound on the excess of the loop as it runs; nan where not asked for
@@ -66,13 +69,23 @@ class GainQuality:
         return fine and (self.sampled is None or self.sampled.stable)
 
     @property
+    def promising(self) -> bool:
+        """Whether there is a gain that nothing known of its poles rules out."""
+        fine = not self.reason and self.abscissa_full < 0
+        return fine and (self.sampled is None or self.sampled.value < 1)
+
+    @property
+    def ruled_out(self) -> bool:
+        """Whether the gain is unstable, or the full plant does not certify that it is stable."""
+        return not (self.stable if self.examined else self.promising)
+
+    @property
     def unbounded(self) -> str:
         """Why the cost has no bound; empty where it has one."""
         if self.reason or np.isfinite(self.cost_excess_at_most):
             return self.reason and f"there is no gain: {self.reason}"
-        if not self.stable:
-            known = self.certified and (self.sampled is None or self.sampled.certified)
-            return "the full loop is unstable" if known else "the full loop is not certified to be stable"
+        if not self.promising:
+            return "the full loop is unstable"
         if np.isnan(self.cost_excess_at_most):
             return "no bound was asked for"
         if np.isfinite(self.cost_excess_proved):
@@ -189,15 +202,25 @@ class GainCheck:
     def quality(self, gain: Gain) -> LoopQuality:
         """Abscissa, excess cost and sampled radius of any gain. Collective.
 
+        The cost is that of the continuous law, on the modes that ``loop`` keeps. Raises SolverError: see
+        :meth:`stability`.
+        """
+        quality = self.stability(gain)
+        excess = self._modal(self.loop, gain.block).cost_excess if quality.abscissa < 0 else np.inf
+        return replace(quality, cost_excess=excess)
+
+    def stability(self, gain: Gain) -> LoopQuality:
+        """Abscissa and sampled radius of any gain, without its cost. Collective.
+
         Plants of no more modes than ``loop`` keeps take all. Larger ones take the abscissa from
-        :func:`softgrasp.lqr.spectrum.certificate.abscissa` and the cost from the lowest modes; where
-        the certificate fails, all modes are taken up to :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`.
+        :func:`softgrasp.lqr.spectrum.certificate.abscissa`; where the certificate fails, all modes are taken up to
+        :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`.
 
         Raises SolverError: no eigenvalue converges, and there are too many modes to take all.
         """
         K = gain.block
         if self.loop.complete:
-            return self._sampled(K, self._modal(self.loop, K))
+            return self._of_poles(K, self.loop)
         fits = self.problem.layout.n_e <= DENSE_LIMIT
         try:
             spectrum = abscissa(self.problem, gain, self._tail_modes)
@@ -209,10 +232,26 @@ class GainCheck:
             whole = self.ticks.modes(whole=True)
             if spectrum is None:  # nor would it converge for the next gain
                 self.loop = whole
-            return self._sampled(K, self._modal(whole, K))
-        excess = self._modal(self.loop, K).cost_excess if spectrum.value < 0 else np.inf
+            return self._of_poles(K, whole)
         poles = spectrum.eigenvalues
-        return self._sampled(K, LoopQuality(spectrum.value, excess, spectrum.certified, spectrum.exact, poles))
+        return self._sampled(K, LoopQuality(spectrum.value, NAN, spectrum.certified, spectrum.exact, poles))
+
+    def _of_poles(self, K: Block, loop: ModalLoop) -> LoopQuality:
+        """From the modes that a loop keeps; certain where they are all. Collective."""
+        poles = loop.poles(K)
+        value = float(poles.real.max()) if np.isfinite(poles).all() else np.inf
+        quality = LoopQuality(value, NAN, loop.complete, loop.complete, poles)
+        if self.law is None or not self.law.every or loop.complete:
+            return self._sampled(K, quality)
+        return replace(quality, sampled=self.ticks.of_modes(K, loop, self.law))
+
+    def excesses(self, gains: Sequence[Gain]) -> Array:
+        """J(K_hat) / J(K) - 1 of the loop as it is sampled, held and late, on the modes kept, (gains,). Collective."""
+        n_s = self.problem.layout.n_s
+        hand = np.vstack([np.eye(n_s, 2 * n_s, n_s), np.linalg.solve(self.problem.M_s, self.solution.gain.K_s)])
+        settle = 6 / max(-float(np.linalg.eigvals(hand).real.max()), np.finfo(float).tiny)
+        blocks = [gain.block for gain in gains]
+        return modal_excess(self.loop, blocks, self.K, self.start, self.law, settle) / self.optimal
 
     def _modal(self, loop: ModalLoop, K: Block) -> LoopQuality:
         return loop.quality(K, self.K, self.start, self.optimal)
@@ -232,16 +271,40 @@ class GainCheck:
         A reduced equation without solution is reported, not raised; a gain whose spectrum does not converge is not
         certified.
         """
+        report = self.first_look(basis)
+        if report.gain is None:
+            return report
+        try:
+            return self.with_quality(report, report.gain)
+        except SolverError:
+            return replace(report, certified=False, examined=True)
+
+    def first_look(self, basis: RiccatiBasis) -> GainReport:
+        """Errors of P and of the gain, and its poles on the modes kept: no solve with the full plant. Collective."""
         try:
             reduced = reduce_riccati(self.problem, basis)
         except ControlError as error:
             return GainReport(basis.name, basis.N, reason=str(error))
         off = factor_error(self.problem, self.Z_absolute, reduced.basis, reduced.P_N)
-        report = GainReport(basis.name, basis.N, off, matrices=reduced.matrices, gain=reduced.gain)
+        error_K, gain = gain_error(self.problem, self.solution.gain, reduced.gain), reduced.gain  # noqa: N806
+        known = self._of_poles(gain.block, self.loop)
+        return GainReport(
+            basis.name, basis.N, off, matrices=reduced.matrices, gain=gain, error_K=error_K,
+            abscissa_full=known.abscissa, certified=known.certified, sampled=known.sampled,
+            examined=self.loop.complete,
+        )  # fmt: skip
+
+    def examined(self, report: GainReport) -> GainReport:
+        """With the spectrum of the full plant; not certified where it does not converge. Collective."""
+        if report.examined or report.gain is None:
+            return report
         try:
-            return self.with_quality(report, reduced.gain)
+            known = self.stability(report.gain)
         except SolverError:
-            return replace(report, error_K=gain_error(self.problem, self.solution.gain, reduced.gain), certified=False)
+            return replace(report, certified=False, examined=True)
+        return replace(
+            report, abscissa_full=known.abscissa, certified=known.certified, sampled=known.sampled, examined=True
+        )
 
     def with_quality[Figures: GainQuality](self, report: Figures, gain: Gain) -> Figures:
         """The same with the figures of a gain. Collective. Raises SolverError: see :meth:`quality`."""
@@ -249,5 +312,5 @@ class GainCheck:
         return replace(
             report, gain=gain, error_K=gain_error(self.problem, self.solution.gain, gain),
             cost_excess=quality.cost_excess, abscissa_full=quality.abscissa, certified=quality.certified,
-            sampled=quality.sampled,
+            sampled=quality.sampled, examined=True,
         )  # fmt: skip

@@ -15,7 +15,8 @@ from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 DENSE_LIMIT = 1300  # up to here all modes can be kept when asked for: order 2600, for those who wait
-LOWEST_MODES = 150  # kept by default: Schur forms of order 300, tenths of a second each
+FEW = 150  # modes up to which a plant keeps them all: its spectrum is exact, a tenth of a second a gain
+LOWEST_MODES = 60  # of a larger one: a hundredth
 
 
 @dataclass(frozen=True)
@@ -58,12 +59,15 @@ class ModalLoop:
     :func:`softgrasp.lqr.spectrum.certificate.abscissa` for large scenes.
 
     Args:
-        modes: how many; all where the plant has no more of them, up to :data:`DENSE_LIMIT`.
+        modes: how many; all where the plant has no more of them, up to :data:`DENSE_LIMIT`. None keeps all up to
+            :data:`FEW`, or :data:`LOWEST_MODES`.
     """
 
-    def __init__(self, problem: RiccatiProblem, modes: int = LOWEST_MODES) -> None:
+    def __init__(self, problem: RiccatiProblem, modes: int | None = None) -> None:
         self.problem, self.comm = problem, problem.layout.comm
         n_e = problem.layout.n_e
+        if modes is None:
+            modes = FEW if n_e <= FEW else LOWEST_MODES
         self.complete = n_e <= min(modes, DENSE_LIMIT)
         self.plant = _all(problem) if self.complete else lowest_plant(problem, min(modes, n_e))
         space = self.plant.space
@@ -84,23 +88,6 @@ class ModalLoop:
         """Eigenvalues of the closed loop. Collective."""
         k = self.gain(K)
         return on_root(self.comm, lambda: np.asarray(scipy.linalg.eigvals(self.A + self.B @ k)))
-
-    def exact(self, K: Block, x: Block, C: Array, dt: float, steps: int) -> Array:
-        """C exp((A + B K) t) xi(0) at t = 0, dt, ..., the loop without a time step, (steps + 1, rows of C). Collective.
-
-        ``K``: gain, transposed, hand-relative; ``x``: x(0) minus target, one column; ``C``: (rows, 2 n_s + 2 k).
-        """
-        k, xi = self.gain(K), self.state(x)[:, 0]
-
-        def march() -> Array:
-            step, state, values = scipy.linalg.expm(dt * (self.A + self.B @ k)), xi, [C @ xi]
-            with np.errstate(over="ignore", invalid="ignore"):  # of a gain that does not stabilise
-                for _ in range(steps):
-                    state = step @ state
-                    values.append(C @ state)
-            return np.stack(values)
-
-        return on_root(self.comm, march)
 
     def quality(self, K: Block, best: Block, x: Block, optimal: float) -> LoopQuality:
         """Abscissa and cost of a gain against the optimal one. Collective.

@@ -14,7 +14,7 @@ from softgrasp.lqr.lowrank.shifts import frequency_estimate
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LOWEST_MODES, ModalLoop, SampledRadius
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, FEW, ModalLoop, SampledRadius
 from softgrasp.lqr.spectrum.tail import Tail, tail_modes
 
 SAFE = 0.5  # small gain below which the modes left out are harmless; the rest covers what lies between grid points
@@ -115,7 +115,7 @@ class SampledLoop:
         modes: how many a large plant keeps.
     """
 
-    def __init__(self, problem: RiccatiProblem, loop: ModalLoop | None = None, modes: int = LOWEST_MODES) -> None:
+    def __init__(self, problem: RiccatiProblem, loop: ModalLoop | None = None, modes: int = FEW) -> None:
         self.problem, self.comm = problem, problem.layout.comm
         self.n_e = problem.layout.n_e
         self.kept = min(modes, self.n_e)
@@ -130,6 +130,11 @@ class SampledLoop:
             return answer
         self.modes(whole=True)
         return self._radius(self._parts(K), law)
+
+    def of_modes(self, K: Block, loop: ModalLoop, law: Sampling) -> SampledRadius:
+        """Radius on the modes that a loop keeps; certified where they are all. Collective."""
+        parts = _Parts(loop.A, loop.B, loop.gain(K), loop.complete, reason="" if loop.complete else "not examined")
+        return self._radius(parts, law)
 
     def stable_rate(self, K: Block, law: Sampling, end: float, most: float = 1.0) -> StableRate | None:
         """About the lowest rate above the own one with a stable loop; None when there is none. Collective.

@@ -96,19 +96,47 @@ class Potential:
             W[first : first + width] = self.cells.weight @ density
         return self._sum(W)
 
+    def _states(self, a: Array) -> tuple[Array, Array, Array]:
+        """H (d, d, m q) of coordinates (m, k), the points of a state side by side, with lam and mu (m q,)."""
+        H = (a @ self._rows).reshape(len(a), self.d, self.d, -1).transpose(1, 2, 0, 3)
+        return H.reshape(self.d, self.d, -1), np.tile(self.lam, len(a)), np.tile(self.mu, len(a))
+
+    def forces(self, a: Array) -> Array:
+        """dW_r / da of coordinates (m, k) at once, (m, k)."""
+        return self._pulled(self.law.stress(*self._states(a)), len(a))
+
+    def discrete_forces(self, a: Array, w: Array) -> Array:
+        """f_alg of steps from a to a + 2 w, (m, k) each, at once, (m, k); infinite where a point of any has J <= 0."""
+        H, lam, mu = self._states(a)
+        P, _ = self.law.step(self.law.start(H), self._states(w)[0], lam, mu)
+        if P is None:
+            return np.full_like(a, np.inf)
+        return self._pulled(P, len(a))
+
+    def _pulled(self, P: Array, m: int) -> Array:
+        """B' P of every state from the stress of :meth:`_states`, (m, k)."""
+        P = P.reshape(self.d, self.d, m, -1) * self.cells.weight
+        return self._sum(P.transpose(2, 0, 1, 3).reshape(m, -1) @ self._rows.T)
+
+    def tangents(self, a: Array) -> Array:
+        """d^2 W_r / da^2 of coordinates (m, k) at once, (m, k, k)."""
+        n = self.d**2
+        A = self.law.tangent(*self._states(a)).reshape(n, n, len(a), -1) * self.cells.weight
+        B = np.ascontiguousarray(self._rows.reshape(self.k, n, -1).transpose(2, 1, 0))  # (q, n, k)
+        stiff = A.transpose(2, 3, 0, 1) @ B  # products of matrices, which einsum has none of here
+        return self._sum(B.reshape(-1, self.k).T @ stiff.reshape(len(a), -1, self.k))
+
     def weighted_stress(self, a: Array) -> Array:
         """Stress times its weight, xi vol P(I + B a), (d, d, q)."""
         return np.asarray(self.cells.weight * self.law.stress(self.gradient(a), self.lam, self.mu))
 
     def force(self, a: Array) -> Array:
         """dW_r / da [N in the coordinates], (k,)."""
-        return self._sum(self._rows @ self.weighted_stress(a).ravel())
+        return np.asarray(self.forces(a[None])[0])
 
     def tangent(self, a: Array) -> Array:
         """d^2 W_r / da^2, (k, k)."""
-        A = self.cells.weight * self.law.tangent(self.gradient(a), self.lam, self.mu)
-        B = self.cells.B
-        return self._sum(np.einsum("aijq,ijklq,bklq->ab", B, A, B, optimize=True))
+        return np.asarray(self.tangents(a[None])[0])
 
     def begin(self, a: Array) -> None:
         """Start a step at a."""

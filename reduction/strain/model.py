@@ -21,10 +21,14 @@ from softgrasp.fem.petsc import Array
 from softgrasp.reduction.model import ModelError, Outputs
 from softgrasp.reduction.online import ReducedTrajectory, checked_hand
 from softgrasp.reduction.strain.cells import Cells, Potential
+from softgrasp.reduction.strain.indicator import Finer, estimated_error
 from softgrasp.reduction.strain.stepper import StrainProblem, march_strain
 
 TOLERANCE = 1e-10  # of a step's residual: the drift of a model's own energy stays near it
 SLACK = 1e-9  # of the edges of the box: rounding of the user's own arithmetic
+# of accelerations: those of a run are means over its steps h, off the peak of a motion by up to (w h)^2 / 6, hence 1 %
+# from 25 steps a period on; another step of the same motion comes closer to the peak than the training did
+LOAD_SLACK = 1e-2
 REACH, SMALL = 2.0, 0.02  # times what the training runs reached, of coordinates above this share of the largest
 LOAD_STEPS, NEWTON_STEPS = 10, 30  # on the way to an equilibrium
 
@@ -49,7 +53,7 @@ class TrainedBox:
 
     def refuse_load(self, load: Array) -> str:
         """Why accelerations a_s - g (steps, n_s) lie outside; empty inside."""
-        room = SLACK * np.abs(self.load).max(initial=0.0)
+        room = LOAD_SLACK * np.abs(self.load).max(initial=0.0)
         for i, (low, high) in enumerate(self.load):
             least, most = float(load[:, i].min(initial=0.0)), float(load[:, i].max(initial=0.0))
             if least < low - room or most > high + room:
@@ -73,9 +77,8 @@ class TrainedBox:
 class StrainRun(ReducedTrajectory):
     """A reduced run at finite strain, x = [q_s, v_s, a, a']."""
 
-    # problem, load: what was stepped
-    problem: StrainProblem = field(repr=False)
-    load: Array = field(repr=False)
+    small: SmallStrainModel = field(repr=False)  # what was stepped
+    acceleration: Array = field(repr=False)  # a_s - g [+ alpha v_s] at the midpoints, (steps, n_s) [m/s^2, rad/s^2]
     evaluations: float  # of the force, in the mean of a step
     restarts: int  # fresh tangents
     engine: str  # "C" or "NumPy"
@@ -93,14 +96,26 @@ class StrainRun(ReducedTrajectory):
     @cached_property
     def energy(self) -> Array:
         """|v|^2 / 2 + W_r of every state [J], (steps + 1,)."""
-        return np.asarray(self.problem.potential.energy(self.a) + (self.v**2).sum(axis=1) / 2)
+        return np.asarray(self.small.problem.potential.energy(self.a) + (self.v**2).sum(axis=1) / 2)
+
+    @cached_property
+    def error_estimate(self) -> float:
+        """Estimate, no bound, of |Z - Phi A|_F / |Z|_F against the full run, see `indicator.py`; made at the first use.
+
+        Not a number where the model brings no finer space: one with all cells of the body.
+        """
+        problem, finer = self.small.finer, self.small.model.finer
+        if problem is None or finer is None:
+            return float("nan")
+        load, weight = -self.acceleration @ finer.G.T, finer.G @ self.small.gravity
+        return estimated_error(problem, finer.gram, load, weight, coordinates(self))
 
     @cached_property
     def energy_drift(self) -> float:
         """Largest |E_n - E_0 - work + loss| over the largest of the four seen, dimensionless."""
-        step = np.diff(self.a, axis=0)  # 2 w
-        work = np.concatenate([[0.0], np.cumsum(np.einsum("ti,ti->t", step, self.load))])
-        lost = np.cumsum(np.einsum("ti,ij,tj->t", step, self.problem.D, step, optimize=True)) / self.problem.dt
+        step, problem, load = np.diff(self.a, axis=0), self.small.problem, -self.acceleration @ self.small.model.G.T
+        work = np.concatenate([[0.0], np.cumsum(np.einsum("ti,ti->t", step, load))])
+        lost = np.cumsum(np.einsum("ti,ij,tj->t", step, problem.D, step, optimize=True)) / problem.dt
         lost = np.concatenate([[0.0], lost])
         defect = np.abs(self.energy - self.energy[0] - work + lost).max()
         scale = max(float(np.abs(x).max()) for x in (self.energy, work, lost))
@@ -119,8 +134,15 @@ class SmallStrainModel:
 
     model: StrainModel  # it comes from
     problem: StrainProblem  # potential, damping, tangent at rest, step
+    materials: tuple[LayerMaterial, ...]  # one a layer
     gravity: Array  # acceleration of free fall, (n_s,)
     outside: bool = False  # runs outside of the training box are allowed
+
+    @cached_property
+    def finer(self) -> StrainProblem | None:
+        """The problem that answers are checked in, made at the first use; None where the model brings none."""
+        finer, dt = self.model.finer, self.problem.dt
+        return None if finer is None else strain_problem(finer, self.materials, self.model.alpha, dt)
 
     def equilibrium(self) -> Array:
         """The a with dW_r/da = G g, by Newton's method under growing load, (k,).
@@ -173,7 +195,16 @@ class SmallStrainModel:
         times = dt * np.arange(float(len(q)))
         x = np.hstack([q, v, done.a, done.v])
         counts = done.evaluations, done.restarts, done.engine
-        return StrainRun(times, x, q, v, y, model.outputs.names, self.problem, load, *counts)
+        return StrainRun(times, x, q, v, y, model.outputs.names, self, c, *counts)
+
+
+def strain_problem(
+    space: StrainModel | Finer, materials: tuple[LayerMaterial, ...], alpha: float, dt: float
+) -> StrainProblem:
+    """Potential, damping and tangent at rest of a space at materials, one a layer."""
+    K = [m.mu * a + m.lam * b for m, a, b in zip(materials, space.K_mu, space.K_lambda, strict=True)]
+    D = alpha * np.eye(len(space.G)) + sum(m.beta * each for m, each in zip(materials, K, strict=True))
+    return StrainProblem(Potential(space.cells, materials), D, sum(K), dt)
 
 
 def refuse(reason: str, outside: bool) -> None:
@@ -208,6 +239,7 @@ class StrainModel:
     Phi: Array | None = None
     scene_hash: str = ""  # of the scene it was made for
     origin: dict[str, Any] = field(default_factory=dict)  # of `reduction.origin`, what that scene says of a run; or {}
+    finer: Finer | None = None  # space in which its answers are checked; None leaves them without an estimate
     seconds: dict[str, float] = field(default_factory=dict)  # offline, by stage
 
     @property
@@ -249,9 +281,7 @@ class StrainModel:
         refuse(self.box.refuse(materials), outside)
         own = self.gravity if gravity is None else np.asarray(gravity, dtype=float)
         g = np.zeros(self.G.shape[1]) if own is None else own
-        K = [m.mu * a + m.lam * b for m, a, b in zip(materials, self.K_mu, self.K_lambda, strict=True)]
-        D = self.alpha * np.eye(self.k) + sum(m.beta * each for m, each in zip(materials, K, strict=True))
-        return SmallStrainModel(self, StrainProblem(Potential(self.cells, materials), D, sum(K), dt), g, outside)
+        return SmallStrainModel(self, strain_problem(self, materials, self.alpha, dt), materials, g, outside)
 
     def displacement(self, a: Array) -> Array:
         """Deformation z = Phi a, local rows (n_local, m), of coordinates (m, k).

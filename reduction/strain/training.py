@@ -6,7 +6,8 @@ weighting [FCA15]: xi >= 0, most of them zero, with
     |sum_e xi_e g_e - sum_e g_e| <= tau |sum_e g_e|,   g_e = the cell's part of dW_r/da, stacked over training states.
 
 The states are those of the model on all cells, which is what the sampled one is to repeat. tau is half of that model's
-own error unless another is asked for: a smaller one would cost cells that the basis makes nothing of.
+own error unless another is asked for: a smaller one would cost cells that the basis makes nothing of. Twice the columns
+and cells sampled for them go with every model, to estimate the error of its answers (`indicator.py`).
 
 Errors: everything comes from small products with the snapshots, made once for a basis and all that begin it:
 |Z - Phi A|_W^2 = |Z|_W^2 - 2 (Phi'W Z) : A + A : (Phi'W Phi) A, W = I, K_ee or M_ee. Rounding leaves 1e-8 of it.
@@ -41,6 +42,7 @@ from softgrasp.reduction.parameters import thinned
 from softgrasp.reduction.projection import project_outputs
 from softgrasp.reduction.replay import FullRun, check_scenes
 from softgrasp.reduction.strain.cells import Cells, Potential
+from softgrasp.reduction.strain.indicator import COLUMNS, Finer
 from softgrasp.reduction.strain.model import SmallStrainModel, StrainModel, StrainRun, TrainedBox, coordinates
 from softgrasp.reduction.strain.nnls import nnls, on_one_rank
 
@@ -143,7 +145,7 @@ class Training:
 
     model: Model  # the scene
     runs: tuple[FullRun, ...]  # full runs to train on
-    Phi: Array  # largest basis, local rows (n_local, k)
+    Phi: Array  # largest basis, and as many columns again where the snapshots carry them, local rows (n_local, K)
     cells: Cells  # all cells of this rank
     offset: int  # number of this rank's first cell
     references: tuple[Reference, ...]  # the runs in terms of the basis
@@ -233,34 +235,46 @@ class Training:
 
     def family(self, N: int, taus: Sequence[float | None]) -> list[StrainModel]:
         """Models of one dimension at several tau; the forces are gathered once. Collective."""
-        comm, k = self.model.system.layout.comm, displacements(self.model.system, N)
+        k = displacements(self.model.system, N)
         error, all_cells = self.galerkin_error(k), self.leading(k)
+        K, goal = min(COLUMNS * k, self.whole.k), float(np.clip(error / 2, *TAUS))
         with self._stage(k, "forces"):
-            G = self._forces(k)
-            C, c = on_one_rank(comm, G)
-        models, counts = [], comm.allgather(G.shape[1])
-        for tau in taus:
-            goal = float(np.clip(error / 2, *TAUS)) if tau is None else tau
-            with self._stage(k, "weights"):
-                weights = on_root(comm, partial(nnls, C, c, goal))
-                xi = weights.x[sum(counts[: comm.rank]) :][: counts[comm.rank]]
-                cells = gathered(comm, all_cells.cells.sampled(xi), self.offset)
-            model = replace(all_cells, cells=cells, tau=goal, residual=weights.residual, error_galerkin=error)
+            G = self._forces(k, K)
+        with self._stage(k, "estimate"):
+            further, gram = self.leading(K), self.references[0].flat.gram[:K, :K]
+            ((cells, _),) = self._sampled(further.cells, G.reshape(-1, G.shape[2]), [goal])
+            finer = Finer(cells, further.K_mu, further.K_lambda, further.G, gram)
+        goals, models = [goal if tau is None else tau for tau in taus], []
+        with self._stage(k, "weights"):
+            done = self._sampled(all_cells.cells, G[:, :k].reshape(-1, G.shape[2]), goals)
+        for goal, (cells, residual) in zip(goals, done, strict=True):
+            model = replace(all_cells, cells=cells, tau=goal, residual=residual, error_galerkin=error, finer=finer)
             models.append(replace(model, seconds={"basis": self.seconds, **self._spent[k]}))
         return models
 
-    def _forces(self, k: int) -> Array:
-        """Every cell's part of dW_r/da at the training states, (states k, cells of this rank)."""
-        cells = self.cells.leading(k)
+    def _sampled(self, cells: Cells, G: Array, taus: Sequence[float]) -> list[tuple[Cells, float]]:
+        """For each tau the sampled cells of the body, and the residual of their weights. Collective."""
+        comm = self.model.system.layout.comm
+        (C, c), counts, answers = on_one_rank(comm, G), comm.allgather(G.shape[1]), []
+        for tau in taus:
+            weights = on_root(comm, partial(nnls, C, c, tau))
+            xi = weights.x[sum(counts[: comm.rank]) :][: counts[comm.rank]]
+            answers.append((gathered(comm, cells.sampled(xi), self.offset), weights.residual))
+        return answers
+
+    def _forces(self, k: int, K: int) -> Array:
+        """Every cell's part of dW/da in K columns at the training states of k, (states, K, cells of this rank)."""
+        cells = self.cells.leading(K)
         count = int(cells.cell.max(initial=-1)) + 1
-        states = int(np.clip(ENTRIES // (k * self.whole.cells_full * len(self.runs)), 20, STATES))
+        states = int(np.clip(ENTRIES // (K * self.whole.cells_full * len(self.runs)), 20, STATES))
         rows = []
         for run, done in zip(self.runs, self.galerkin(k), strict=True):
             potential = Potential(cells, run.model.system.materials)
-            for a in done.a[np.unique(np.linspace(1, len(done.a) - 1, states).round().astype(int))]:
+            chosen = done.a[np.unique(np.linspace(1, len(done.a) - 1, states).round().astype(int))]
+            for a in np.pad(chosen, [(0, 0), (0, K - k)]):
                 each = np.einsum("aijq,ijq->aq", cells.B, potential.weighted_stress(a), optimize=True)
                 rows.append(np.stack([np.bincount(cells.cell, row, count) for row in each]))
-        return np.concatenate(rows)
+        return np.stack(rows)
 
     @contextmanager
     def _stage(self, k: int, key: str) -> Iterator[None]:
@@ -279,10 +293,11 @@ def displacements(system: BlockSystem, N: int) -> int:
 
 
 def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
-    """Phi, local rows (n_local, k), Phi' M Phi = I: POD of z, of one run with v too, in the mass product. Collective.
+    """Phi' M Phi = I: POD of z, of one run with v too, in the mass product. Collective.
 
-    Both weigh the same. The velocities of one run hold shapes that its displacements pass too fast; several runs
-    have these shapes, and their velocities would only crowd out the soft ones.
+    Local rows of k columns and of as many again as the snapshots carry, up to :data:`COLUMNS` k. Both weigh the same:
+    the velocities of one run hold shapes that its displacements pass too fast; several runs have these shapes, and
+    their velocities would only crowd out the soft ones.
 
     Raises BasisError: the snapshots carry fewer columns, or are zero or not finite.
     """
@@ -294,11 +309,11 @@ def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
         q, p = (float(layout.comm.allreduce(np.vdot(Y, times_columns(system.M_ee, Y)))) for Y in (X, V))
         X = np.asfortranarray(np.hstack([X, V * (q / p) ** 0.5 if p > 0 else V]))
     rows, mass = Rows(layout, 1, hand=False), Weight(system.M_hand, system.M_ee)
-    part = pod_part("deformation", rows, X, (mass,), "tsqr", (0,), k)
+    part = pod_part("deformation", rows, X, (mass,), "tsqr", (0,), COLUMNS * k)
     if k > part.rank:
         most = 2 * (layout.n_s + part.rank)
         raise BasisError(f"more displacements than the snapshots carry above rounding; ask for N <= {most}", most=most)
-    (columns,) = part.columns(k)
+    (columns,) = part.columns(min(COLUMNS * k, part.rank))
     return columns.e_q
 
 

@@ -16,6 +16,7 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import on_root
+from softgrasp.fem.run.simulate import frame_count
 from softgrasp.lqr.dense.care import solve_reduced
 from softgrasp.lqr.design.controller import CertifiedController, NoController, certified_controller
 from softgrasp.lqr.design.duration import LoopPlan, largest_cost
@@ -25,6 +26,7 @@ from softgrasp.lqr.design.orders import (
     BasisGains,
     Notify,
     best_gains,
+    certified,
     course_of,
     fast_order,
     reduce_gains,
@@ -127,7 +129,7 @@ def run_loops(design: Design, bases: Sequence[BasisGains], plan: LoopPlan, frame
     def progress(run: Any) -> None:
         notify(done + run.reached, total)
 
-    shown = move_steps(plan.steps, plan.dt, plan.settle, 3 if frames.few else scene.output.frames)
+    shown = move_steps(plan.steps, plan.dt, plan.settle, 3 if frames.few else frame_count(scene, problem.layout.n_e))
     frames.chosen = set(shown)
     loop = ClosedLoop(problem, plan.dt, scene.time.solver, scene.time.rtol, scene.time.reproducible)
     options = LoopOptions(progress=progress, most=largest_cost(design, plan))
@@ -187,7 +189,8 @@ def retune(
     The duality gaps of all gains of one setting come from the same few runs of ``plan``.
     """
     layout = design.problem.layout
-    reason, chosen = outside(design.model), re_tunable(bases, layout.n_s)
+    reason = outside(design.model)
+    chosen = [] if reason else re_tunable(certified(design, bases, range(fast_order(layout.n_s) + 1)), layout.n_s)
     if not reason and layout.states > BOX_STATES:
         reason = (
             f"{layout.states} states are more than {BOX_STATES}: the full solutions to compare with would take long"

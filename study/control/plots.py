@@ -49,8 +49,8 @@ def drawn(basis: BasisGains, key: str) -> tuple[list[int], list[float]]:
 
 
 def unstable(basis: BasisGains, key: str) -> tuple[list[int], list[float]]:
-    """Orders and values of gains not known to stabilise; nan for errors above 100 %."""
-    bad = [r for r in basis.reports if not r.stable and not r.reason]
+    """Orders and values of gains that do not stabilise; nan for errors above 100 %."""
+    bad = [r for r in basis.reports if r.ruled_out and not r.reason]
     return [r.N for r in bad], [getattr(r, key) if getattr(r, key) <= TOP else float("nan") for r in bad]
 
 

@@ -165,7 +165,9 @@ def _fast(r: Retuned) -> str:
 def _mark(gain: GainQuality) -> str:
     if gain.reason:
         return "none"
-    if gain.stable or not gain.certified:
+    if not gain.examined and gain.promising:
+        return "not examined"
+    if gain.stable or (gain.examined and not gain.certified):
         return "stable" if gain.stable else "not certified"
     if gain.abscissa_full >= 0 or gain.sampled is None:
         return "unstable"
@@ -191,7 +193,7 @@ def best_table(bases: Sequence[BasisGains]) -> Table:
     """The best stable gain of every basis, in short."""
     rows: list[Row] = []
     for b in bases:
-        r, unstable = b.best(), ", ".join(str(x.N) for x in b.reports if not x.stable)
+        r, unstable = b.best(), ", ".join(str(x.N) for x in b.reports if x.ruled_out)
         cells: Row = ("",) * 7
         if r is not None:
             errors = (f"{x:.1e}" for x in (r.error_P, r.error_K, r.cost_excess, r.cost_excess_at_most))
@@ -285,8 +287,9 @@ def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Secti
     plan = study.loops.plan
     end = max((r.bounded_to for b in study.bases for r in b.reports if r.stable), default=plan.dt * plan.steps)
     text = (
-        "Each equation is projected on N basis vectors and solved; its gain is tested on the full plant. The bases "
-        "of the paper need P first, the a-priori modes do not. Only stable gains are offered as controllers. "
+        "Each equation is projected on N basis vectors and solved. The bases of the paper need P first, the a-priori "
+        "modes do not. The gain of least cost of each basis is tested on the full plant, and the next best where that "
+        "is not stable; the poles of the others are those of the modes kept. Only stable gains are offered. "
         f"Excess cost and its bounds are those of the loop as it runs: {running_words(study.design)}. The excess cost "
         "is J/J* - 1 over the least cost J* of all inputs, which need not be held, wait or keep a limit. The first "
         f"bound beside it is proved for the whole plant, by the duality gap, for the run to t = {end:.4g} s and the "

@@ -33,7 +33,7 @@ TITLES = {
     "structured": "modes by cost, a priori",
 }
 
-REPORT = ("N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are", "stable", "certified", "reason")
+REPORT = ("N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are", "certified", "examined", "reason")
 BOUNDS = ("cost_excess_proved", "cost_excess_at_most", "bounded_to", "unbounded")
 
 
@@ -190,7 +190,8 @@ def gain_change(solution: RiccatiSolution) -> dict[str, float] | None:
 
 def report_dict(gain: GainQuality, keys: Sequence[str] = REPORT) -> dict[str, Any]:
     """One gain in result.json."""
-    return {key: getattr(gain, key) for key in keys} | {"sampled_radius": radius_of(gain)}
+    known = {"stable": gain.stable if gain.examined or gain.ruled_out else None}  # None: not examined
+    return {key: getattr(gain, key) for key in keys} | known | {"sampled_radius": radius_of(gain)}
 
 
 def radius_of(report: GainQuality) -> float:
@@ -199,7 +200,7 @@ def radius_of(report: GainQuality) -> float:
 
 
 def _retuned(r: Retuned) -> dict[str, Any]:
-    keys = ("error_K", "cost_excess", "abscissa_full", "stable", "reason", *BOUNDS)
+    keys = ("error_K", "cost_excess", "abscissa_full", "reason", *BOUNDS)
     points = [
         {"lambda": p.materials[0].lam, "mu": p.materials[0].mu, "time": p.seconds} | report_dict(p, keys)
         for p in r.points

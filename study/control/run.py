@@ -36,13 +36,21 @@ RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes 
 
 @folder_lock()
 def run_control(
-    path: Path, out: Path, overrides: list[str], console: Console, *, gain_only: bool = False, **flags: Unpack[Flags]
+    path: Path,
+    out: Path,
+    overrides: list[str],
+    console: Console,
+    *,
+    gain_only: bool = False,
+    retune: bool = False,
+    **flags: Unpack[Flags],
 ) -> dict[str, Any]:
     """Design the optimal feedback of a scene file, reduce it, close the loop and write the results. Collective.
 
     Nothing is written before the Riccati equation is solved, but restart files of a large plant: the next call with
     the same scene, folder and rank count goes on from them; they are removed at the end. ``gain_only`` writes the
-    controllers, without closed loop and pictures.
+    controllers, without closed loop and pictures; ``retune`` solves the full equation at the corners, edges and the
+    middle of the box of lambda and mu, to compare re-tuned gains with.
     """
     session = Session("control", path, overrides, out, console, **flags)
     model, sentence = with_control(session.model(session.scene(), steps=False))
@@ -63,6 +71,8 @@ def run_control(
             study = small_study(feedback, watch, sentence)
         else:
             study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence)
+            if retune:
+                study = with_retuning(model, study, watch, bar)
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
         saved = measure.save_controllers(study, out, end_state(model, study))
@@ -113,7 +123,7 @@ def end_state(model: Model, study: GainStudy) -> PlantState:
 def loop_study(
     session: Session, model: Model, feedback: Design, watch: Stopwatch, bar: Progress, note: str
 ) -> tuple[ControlStudy, list[Path], Callable[[], list[Path]]]:
-    """All reduced gains, the closed loops, and gains re-tuned while those are drawn. Collective.
+    """All reduced gains and the closed loops. Collective.
 
     Returned are also the field files, and what waits for the pictures on rank 0.
     """
@@ -139,17 +149,21 @@ def loop_study(
         with watch.stage("finite strain"):
             finite = measure.run_finite(feedback, model, loops.full, duration, counted(bar, "loop of finite strain"))
     study = ControlStudy(feedback, bases, small.controller, small.tick, notes, loops, finite)
-    fields, drawn = frames.close(), _drawn(session, study, frames)
-    if feedback.modal:
-        return study, fields, drawn
+    return study, frames.close(), _drawn(session, study, frames)
+
+
+def with_retuning(model: Model, study: ControlStudy, watch: Stopwatch, bar: Progress) -> ControlStudy:
+    """With gains re-tuned over the box of lambda and mu while the rest is drawn, or a note why not. Collective."""
     retuned: tuple[Retuned, ...] = ()
     with watch.stage("retune"):
-        if finite_strain and model.system.gravity is not None:
+        if study.design.modal:
+            why = "control.method = 'modal' has no reduced equations"
+        elif study.finite is not None and model.system.gravity is not None:
             why = "the stiffness is that of the equilibrium, which moves with the material"
         else:
-            retuned, why = measure.retune(feedback, bases, duration, counted(bar, "re-tuning"))
-    notes = (*notes, f"no re-tuning: {why}") if why else notes
-    return replace(study, retuned=retuned, notes=notes), fields, drawn
+            notify = counted(bar, "re-tuning")
+            retuned, why = measure.retune(study.design, study.bases, study.loops.plan, notify)
+    return replace(study, retuned=retuned, notes=(*study.notes, f"no re-tuning: {why}") if why else study.notes)
 
 
 def _drawn(session: Session, study: ControlStudy, frames: Frames) -> Callable[[], list[Path]]:

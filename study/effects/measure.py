@@ -25,12 +25,14 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.solvers import ITERATIVE
 from softgrasp.study.effects.result import Cost, OffProof
 from softgrasp.study.effects.switch import neutral
 from softgrasp.study.shell.timing import RepeatableRun, interleave, medians, rotated
 
 BURSTS = 7  # short ones make a sample by their median, so that a busy moment of the machine falls out
 BURST_SECONDS = 0.02  # of the steps of one; long against the timer
+SAMPLE_SECONDS = 0.15  # of the bursts of a sample: one with long steps needs fewer, for the moment falls out in them
 BUILD_SECONDS = 6.0  # the builds are repeated at most about this long
 MOST_STEPS = 20_000  # in one sample
 STEPS = 10  # in which nothing may be created
@@ -122,7 +124,7 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
     factored = solver.ksp.getOperators()[0]
     if factored.handle != solver.S.handle:
         sizes["S, factored"] = everywhere(matrix_memory(factored), factored)
-    if solver.name != "cg" and solver.S.comm.size == 1:  # factors spread over ranks are out of reach
+    if solver.name not in ITERATIVE and solver.S.comm.size == 1:  # factors spread over ranks are out of reach
         sizes["factor"] = everywhere(matrix_memory(solver.ksp.getPC().getFactorMatrix()), solver.S)
     return {name: size for name, size in sizes.items() if size > 0}
 
@@ -162,13 +164,12 @@ def measure_steps(comm: MPI.Intracomm, cases: dict[str, MeasuredScene], repeats:
     """Time the steps of all cases interleaved, then count their work, memory and hashes. Collective."""
     steppers = {name: RepeatableRun(case.model) for name, case in cases.items()}
     try:
-        pace = next(iter(steppers.values())).seconds_per_step(5)
-        for stepper in steppers.values():
-            stepper.seconds_per_step(5)
-        count = comm.bcast(int(np.clip(BURST_SECONDS / pace, 5, MOST_STEPS)))
+        pace = {name: stepper.seconds_per_step(5) for name, stepper in steppers.items()}
+        count = comm.bcast(int(np.clip(BURST_SECONDS / pace[SCENE], 5, MOST_STEPS)))
         samplers = {name: partial(stepper.seconds_per_step, count) for name, stepper in steppers.items()}
+        bursts = comm.bcast({name: int(np.clip(SAMPLE_SECONDS / (count * s), 1, BURSTS)) for name, s in pace.items()})
         for _ in range(repeats):
-            for name, seconds in medians(interleave(samplers, BURSTS)).items():
+            for name, seconds in medians(interleave(samplers, BURSTS, bursts)).items():
                 cases[name].seconds.setdefault("step", []).append(seconds)
                 tick()
         for name, case in cases.items():

@@ -139,7 +139,7 @@ def in_company(study: EffectsStudy) -> str:
         for f in study.findings
         if (c := f.company) is not None
     ]
-    return f"With {listed(study.advised)} on, switching one effect alone changes the outputs by: {', '.join(parts)}."
+    return f"With {listed(study.beside)} on, switching one effect alone changes the outputs by: {', '.join(parts)}."
 
 
 def _seconds(median: float, spread: tuple[float, float]) -> str:

@@ -26,8 +26,9 @@ class Company:
     change: Change  # of the outputs of the run
     control: float | None  # of the outputs under a force [1]; None when that is no question
     partners: tuple[str, ...] = ()  # effects beside which it shows, though it does not in the scene as it is
-    either: bool = False  # it and its partner are on; each can go, but not both
-    together: float = 0.0  # change that made it count beside the partners [1]
+    pair: bool = False  # it shows switched together with its partner, not beside it
+    among: tuple[str, ...] = ()  # further effects that had to be switched for that
+    together: float = 0.0  # change by it beside the partners, by the pair if it is one [1]
     forced: bool = False  # it shows only when a force moves the hand
 
 
@@ -134,6 +135,7 @@ class EffectsStudy:
 
     findings: tuple[EffectResult, ...]  # in the order of `fem.effects.EFFECTS`
     advised: tuple[str, ...]  # effects that are on when every advice is followed, for control alone included
+    beside: tuple[str, ...]  # those of them that were on when each effect was switched alone
     explanation: Explanation  # of the scene as it is; its warnings are repeated in the report
     tolerance: float  # relative change that counts [1]
     repeats: int  # samples behind each median of a step

@@ -17,21 +17,14 @@ from softgrasp.fem.errors import ResourceError, SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import free_bytes, size_text
 from softgrasp.fem.model.scales import rigid_inertia
-from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.effects.experiments import Experiments, check_elements
 from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, ends, measure_builds, measure_steps, objects_of
 from softgrasp.study.effects.page import compose
 from softgrasp.study.effects.result import EffectsStudy
-from softgrasp.study.effects.switch import Scales, Switch, switches
-from softgrasp.study.effects.verdict import (
-    Changes,
-    Experiments,
-    advised_together,
-    check_elements,
-    find,
-    finite_strain_beside,
-    shows,
-)
+from softgrasp.study.effects.switch import Scales, switches
+from softgrasp.study.effects.together import Changes, advised
+from softgrasp.study.effects.verdict import find, shows
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.shell.folder import folder_lock
@@ -58,7 +51,7 @@ def study_effects(
     omega = explanation.time.omega
     first = float(omega[0]) if len(omega) else None
     scales = Scales(model.system.layout.dimension, *rigid_inertia(model), first)
-    effects = tuple(_runnable(s, comm) for s in switches(scene, scales))
+    effects = switches(scene, scales)
     tried = [s for s in effects if s.other is not None]
     scenes = {SCENE: scene} | {s.name: s.other for s in tried if s.other is not None} | {AGAIN: scene}
     check_variants(scene, comm, explanation, len(scenes))
@@ -73,18 +66,20 @@ def study_effects(
     runs = Experiments(scene, scales, {on: cases[SCENE].model} | {on ^ {s.name}: cases[s.name].model for s in tried})
     changes: Changes = {}
     for s in tried:
-        changes[s.name] = runs.alone(s.name)
+        try:
+            changes[s.name] = runs.alone(s.name)
+        except SolverError as error:
+            if s.on or s.name != "finite_strain":
+                raise
+            # on trial it may leave what its law describes: then there is nothing to compare
+            failed = replace(s, other=None, reason=f"the run with it fails ({error})")
+            effects = tuple(failed if e is s else e for e in effects)
+            del cases[s.name]
         tick()
-    needed = frozenset(s.name for s in tried if shows(s, changes[s.name], explanation.effects[s.name], scene))
-    # with other effects on trial a run of finite strain is dear and may leave its law: no pairs with it
-    apart = {s.name for s in tried if s.name == "finite_strain" and not s.on}
-    joint = tuple(name for name in changes if name not in apart)
-    together = advised_together(runs, joint, needed - apart, scene.study.tolerance)
-    for name in apart:
-        company = finite_strain_beside(runs, name, changes[name], frozenset(together.on))
-        together.company[name] = company
-        if name in needed or company.partners:
-            together = replace(together, on=(*together.on, name))
+    needed = frozenset(
+        s.name for s in tried if s.name in changes and shows(s, changes[s.name], explanation.effects[s.name], scene)
+    )
+    together = advised(runs, needed, changes)
     elements = check_elements(runs.models[on], runs.first, scene.study.tolerance)
     measure_steps(comm, cases, repeats, tick)
     for name, case in cases.items():
@@ -96,6 +91,7 @@ def study_effects(
     return EffectsStudy(
         findings=tuple(find(s, explanation, cases, changes, together, noise) for s in effects),
         advised=together.on,
+        beside=together.beside,
         explanation=explanation,
         tolerance=scene.study.tolerance,
         repeats=repeats,
@@ -108,17 +104,6 @@ def study_effects(
         | {"steps": scene.time.steps, "cells": explanation.sizes.cells},
         elements=elements,
     )
-
-
-def _runnable(s: Switch, comm: MPI.Intracomm) -> Switch:
-    """Finite strain on trial may leave what its law describes: then there is nothing to compare. Collective."""
-    if s.on or s.other is None or s.name != "finite_strain":
-        return s
-    try:
-        simulate(build(s.other, comm=comm))
-    except SolverError as error:
-        return replace(s, other=None, reason=f"the run with it fails ({error})")
-    return s
 
 
 def check_variants(scene: Scene, comm: MPI.Intracomm, explanation: Explanation, variants: int) -> None:

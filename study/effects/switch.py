@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pydantic import ValidationError
+
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.effects.gravity import EARTH
 from softgrasp.fem.scene.scene import Scene
@@ -69,7 +71,10 @@ def switch(scene: Scene, name: str, scales: Scales) -> Switch:
             table["hand"] |= {} if on else {"inertia": _hand_inertia(scene, scales)}
             _resize(table, d, d if on else d + len(scales.inertia))
 
-    return Switch(name, on, value, scene.changed(edit), "", strength, unit)
+    try:
+        return Switch(name, on, value, scene.changed(edit), "", strength, unit)
+    except ValidationError as error:
+        return Switch(name, on, value, None, error.errors()[0]["msg"].removeprefix("Value error, "))
 
 
 def neutral(scene: Scene, name: str, d: int) -> Scene | None:
@@ -80,10 +85,7 @@ def neutral(scene: Scene, name: str, d: int) -> Scene | None:
 
 def _obstacle(scene: Scene, name: str, scales: Scales) -> str:
     """Why the effect cannot be switched; empty where it can."""
-    active = {other for other, effect in EFFECTS.items() if effect.active(scene)}
-    on = name in active
-    if not on and active | {name} >= {"rotation", "finite_strain"}:
-        return "effects.rotation and effects.finite_strain exclude each other"
+    on = EFFECTS[name].active(scene)
     if name == "layers" and not on:
         return "there is no second material to try: layers cannot be invented"
     if name == "damping" and not on and scales.omega is None:

@@ -17,11 +17,12 @@ from softgrasp.fem.model.memory import Need, factor_bytes, need
 from softgrasp.fem.model.refined import by_lines, scene_ends
 from softgrasp.fem.model.scales import SMALL_STRAIN, measure
 from softgrasp.fem.run.motion import largest_acceleration
+from softgrasp.fem.run.snapshots import spread
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
 from softgrasp.study.forward.accuracy import estimate_error
-from softgrasp.study.forward.cautions import coarse, locking, poisson_ratios, turned
+from softgrasp.study.forward.cautions import coarse, locking, looked_at, poisson_ratios, turned
 from softgrasp.study.forward.result import ModelSizes, model_sizes, output_places
 from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.files import to_json
@@ -138,8 +139,10 @@ def explain_model(model: Model) -> Explanation:
         for key, e in EFFECTS.items()
     }
     sizes = model_sizes(model)
-    stored = scene.output.snapshots == "memory"
+    stored = scene.output.snapshots in ("auto", "memory")
     columns = scene.time.steps // scene.output.every + 1 if stored else 0
+    if scene.output.snapshots == "auto":
+        columns = len(spread(columns, looked_at(layout.n_e)))
     dt = scene.time_end / scene.time.steps
     poisson = poisson_ratios(system)
     return Explanation(

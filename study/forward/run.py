@@ -15,9 +15,9 @@ from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError, SolverError
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.run.checkpoint import check_ranks
-from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.simulate import FRAMES, LIGHT, Run, RunOptions, frame_count, simulate
 from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estimate_error
-from softgrasp.study.forward.cautions import run_warnings
+from softgrasp.study.forward.cautions import looked_at, run_warnings
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import speed_up
@@ -56,7 +56,10 @@ def run_simulate(
     if resume:
         check_ranks(session.comm, out / "checkpoint")
     model = session.model(scene)
-    scene, frames = model.scene, Frames(model, out, session.pictures)
+    scene, frames, n_e = model.scene, Frames(model, out, session.pictures), model.system.layout.n_e
+    if (count := frame_count(scene, n_e)) < FRAMES and scene.output.frames == "auto" and scene.output.fields != "none":
+        text = f"fields at {count + 1} instants, for n_e is above {LIGHT}; --set output.frames={FRAMES} writes more"
+        console.print(text, soft_wrap=True)
 
     def join(run: Run) -> None:
         frames.begin(run)
@@ -71,7 +74,7 @@ def run_simulate(
             kind = "steps" if newton is None else f"steps ({newton.mean:.2g} iterations each)"
             bar.update(task, completed=run.reached, description=kind)
 
-        options = RunOptions(out, resume, until, progress, frames, join, frames.keep)
+        options = RunOptions(out, resume, until, progress, frames, join, frames.keep, looked_at(n_e))
         try:
             run = simulate(model, options)
         except (Interrupted, ResourceError) as stopped:

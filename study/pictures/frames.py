@@ -18,7 +18,7 @@ from softgrasp.fem.run.simulate import Run, frame_steps
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.study.pictures.shapes import way_done
 
-MANY_VERTICES = 200_000  # above, only the instants of the still picture are kept
+MANY_VERTICES = 50_000  # above, only the instants of the still picture are kept
 LARGE_RESTART = 2**26  # bytes: no room is kept for a larger restart file, it would stop runs that end well
 SHOWN = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the way, chosen before the run when few instants are kept
 
@@ -106,7 +106,7 @@ class Frames:
         """How many frames before a step the pictures must do without; rank 0 only."""
         if self.picture is None or self.few:
             return 0
-        expected = sum(step <= begun for step in frame_steps(self.model.scene))
+        expected = sum(step <= begun for step in frame_steps(self.model.scene, self.model.system.layout.n_e))
         return max(0, expected - len(self.steps))
 
     def __call__(self, run: Run) -> None:
@@ -132,7 +132,7 @@ class Frames:
 
     def _ahead(self, run: Run) -> set[int]:
         """Steps of the still picture before they are reached; the hand's table is known unless forces drive it."""
-        grid = frame_steps(self.model.scene)
+        grid = frame_steps(self.model.scene, self.model.system.layout.n_e)
         times = np.arange(len(run.drive.q), dtype=np.float64)
         done = way_done(np.column_stack([times, run.drive.q]), times[grid])
         return {grid[int(np.argmin(abs(done - share)))] for share in SHOWN[:-1]} | {grid[-1]}

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.errors import ResourceError, SceneError
+from softgrasp.fem.errors import ResourceError, SceneError, no_pipe
+from softgrasp.fem.fields.vtu import Collection, check_file
 
 SHOWN = 4  # bodies in a picture, equally spaced in time, first and last included
 PEAK = 99  # percentile of the colours' end: corners are singular, and the few cells there would take all colours
@@ -29,16 +32,18 @@ class Move:
             raise ResourceError(
                 f"PyVista is not installed; pip install 'softgrasp[view]', or open {folder}/fields.pvd in ParaView"
             ) from error
-        parts = {int(path.stem.removeprefix("fields-from")): path for path in folder.glob("fields-from*.pvd")}
+        names = [(path.stem.removeprefix("fields-from"), path) for path in folder.glob("fields-from*.pvd")]
+        parts = {int(step): path for step, path in names if step.isdecimal()}
         if (folder / "fields.pvd").exists():
             parts[0] = folder / "fields.pvd"
-        readers = [pyvista.PVDReader(str(parts[step])) for step in sorted(parts)]
-        readers = [reader for reader in readers if reader.time_values]
-        if not readers:
+        series = [entries for step in sorted(parts) if (entries := _series(parts[step]))]
+        if not series:
             raise SceneError(f"{folder} has no field files; name the output folder of simulate or control")
-        ends = [reader.time_values[0] for reader in readers[1:]] + [np.inf]
-        self._instants = [(t, r) for r, end in zip(readers, ends, strict=True) for t in r.time_values if t < end]
-        self.times, self.field = [t for t, _ in self._instants], field  # [s]
+        ends = [entries[0][0] for entries in series[1:]] + [np.inf]
+        self._read_file = pyvista.read
+        pairs = zip(series, ends, strict=True)
+        self._instants = [entry for entries, end in pairs for entry in entries if entry[0] < end]
+        self.times, self.field = [t for t, *_ in self._instants], field  # [s]
         first = self._read(0)
         self.flat = first.bounds.z_max == first.bounds.z_min
         known = {*first.point_data.keys(), *first.cell_data.keys()}
@@ -66,13 +71,30 @@ class Move:
         return f"{self.times[i]:.3g} s\nhand at ({', '.join(f'{x:.3g}' for x in hand[:d])}) m"
 
     def _read(self, i: int) -> Any:
-        t, reader = self._instants[i]
-        reader.set_active_time_value(t)
-        return reader.read()[0]
+        _, file, checks = self._instants[i]
+        with _refusing(file):
+            check_file(file, checks)
+        return self._read_file(file)
 
     def _value(self, grid: Any) -> np.ndarray:
         values = np.asarray(grid[self.field], dtype=np.float64)
         return values if values.ndim == 1 else np.asarray(np.linalg.norm(values, axis=1))
+
+
+@contextmanager
+def _refusing(file: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise SceneError(f"{file} cannot be read ({error.strerror or error}); run the scene again") from None
+    except ValueError as error:
+        raise SceneError(f"{file} is damaged, or of an earlier version ({error}); run the scene again") from None
+
+
+def _series(path: Path) -> list[tuple[float, Path, str]]:
+    """Times, files and checksums of a list of field files. Raises SceneError: it is damaged."""
+    with _refusing(path):
+        return Collection.read(no_pipe(path))
 
 
 def view(folder: Path, field: str, save: Path | None) -> None:

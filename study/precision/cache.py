@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -14,14 +14,14 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp import package_version
-from softgrasp.fem.errors import Interrupted, agree
+from softgrasp.fem.checksums import read_manifest, write_manifest
+from softgrasp.fem.errors import CheckpointError, Interrupted, agree
 from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.files import to_json
 
-FORMAT = 3  # of the cached files
+FORMAT = 4  # of the cached files
 
 
 class Cache:
@@ -68,10 +68,8 @@ class Cache:
         """The cached values of a class, or the measured ones, which are then kept; both as they come out of JSON."""
         rows = None
         if self.comm.rank == 0:
-            try:
-                rows = json.loads(self.path(kind, key).read_text())["value"]
-            except (OSError, ValueError, KeyError):
-                rows = None
+            with suppress(CheckpointError):  # missing or damaged: it is measured again
+                rows = read_manifest(self.path(kind, key), FORMAT)["value"]
         rows = self.comm.bcast(rows)
         if rows is not None:
             self.hits += 1
@@ -80,15 +78,9 @@ class Cache:
         rows = json.loads(json.dumps(to_json(list(measure()))))
         with agree(self.comm):
             if self.comm.rank == 0:
-                self._write(self.path(kind, key), {"kind": kind, "key": key, "value": rows})
+                self.folder.mkdir(parents=True, exist_ok=True)
+                write_manifest(self.path(kind, key), {"format": FORMAT, "kind": kind, "key": key, "value": rows})
         return [_revived(of, row) for row in self.comm.bcast(rows)]
-
-    def _write(self, path: Path, data: dict[str, Any]) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part")
-        note(part, path)
-        part.write_text(json.dumps(data))
-        os.replace(part, path)  # a file is there whole or not at all
 
 
 def _revived[T](of: type[T], row: dict[str, Any]) -> T:

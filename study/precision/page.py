@@ -19,13 +19,12 @@ from softgrasp.study.precision.points import (
     TITLES,
     BasisPoint,
     ForwardPoint,
-    LoopPoint,
     ReducedPoint,
     ReducedRiccatiPoint,
     Request,
     RiccatiPoint,
 )
-from softgrasp.study.precision.result import LoopReference, RiccatiReference, WorkStudy
+from softgrasp.study.precision.result import RiccatiReference, WorkStudy
 from softgrasp.study.precision.tables import (
     CAPTIONS,
     budget_table,
@@ -107,7 +106,7 @@ def draw(study: WorkStudy, budget: float | None, out: Path) -> list[Path]:
     files: list[Path] = []
     paper = paper_of(study.scene)
     forward, reduced, bases = study.of(ForwardPoint), study.of(ReducedPoint), study.of(BasisPoint)
-    riccati, small_riccati, loop = study.of(RiccatiPoint), study.of(ReducedRiccatiPoint), study.of(LoopPoint)
+    riccati, small_riccati = study.of(RiccatiPoint), study.of(ReducedRiccatiPoint)
     references = {name: question.reference for name, question in study.questions.items()}
     if forward and study.truth is not None:
         slopes, png = study.questions["forward"].slopes, out / "work_forward.png"
@@ -120,8 +119,6 @@ def draw(study: WorkStudy, budget: float | None, out: Path) -> list[Path]:
         files += plots.figure_riccati(riccati, tight.error, paper == "control", out / "work_riccati.png")
     if small_riccati:
         files += plots.figure_reduced_riccati(small_riccati, paper == "control", out / "work_reduced_riccati.png")
-    if loop and isinstance(optimal := references["loop"], LoopReference):
-        files += plots.figure_loop(loop, optimal.error, out / "work_loop.png")
     if budget is not None:
         every = [*forward, *reduced, *study.measured_for_the_answers]
         files += plots.figure_budget(every, budget, out / "work_budget.png")

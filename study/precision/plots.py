@@ -21,7 +21,6 @@ from softgrasp.study.precision.fit import Slope, pareto, series_of, usable
 from softgrasp.study.precision.forward import on_meshes, over_steps
 from softgrasp.study.precision.points import (
     ForwardPoint,
-    LoopPoint,
     ReducedPoint,
     ReducedRiccatiPoint,
     RiccatiPoint,
@@ -36,7 +35,6 @@ from softgrasp.study.reduce.linear.plots import looks
 ORDER_LOOK = {1: (BLUE, "o"), 2: (ORANGE, "s"), 3: (GREEN, "^")}
 SERIES_LOOK = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PURPLE, "D"), (HAND, "v"))
 METHOD_LOOK = {"newton_adi": (BLUE, "o"), "radi": (ORANGE, "s"), "galerkin": (GREEN, "^"), "dense": (HAND, "D")}
-GAIN_COLOURS = (HAND, ORANGE, BLUE, GREEN, PURPLE)
 FRONT: dict[str, Any] = {"color": HAND, "lw": 1.6, "alpha": 0.35, "zorder": 1, "marker": "o", "ms": 7, "mfc": "none"}
 THIN: dict[str, Any] = {"lw": 0.6, "alpha": 0.6, "zorder": 2}
 LINE: dict[str, Any] = {"color": "#D00000", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}
@@ -45,7 +43,6 @@ CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 5, "mew": 1.1, "color": 
 EDGE: dict[str, Any] = {"clip_on": False, "in_layout": False}
 NEAR = 1e-2  # of the lowest point: a reference that is better still is not drawn, the text tells its error
 TOP, LOW = 1.0, 1e-13  # errors and excess costs of gains above are on the edge, below are rounding
-TICK = 1e-3  # [s], of a robot's control loop
 DEFORMATION = "relative error of the deformation"
 
 
@@ -62,10 +59,10 @@ class Between(Formatter):
         return f"{x:g}" if powers <= 1 and digit in (2, 5) else ""
 
 
-def _one_and_two(ratio: float) -> list[Any]:
-    """A figure with one panel, by this wider, beside two."""
+def _one_and_two() -> list[Any]:
+    """A figure with one wide panel beside two."""
     figure = plt.figure(figsize=(WIDTH, 4.6), layout="constrained")
-    grid = figure.add_gridspec(2, 2, width_ratios=(ratio, 1))
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.7, 1))
     return [figure, *(figure.add_subplot(grid[k]) for k in ((slice(None), 0), (0, 1), (1, 1)))]
 
 
@@ -117,7 +114,7 @@ def figure_forward(
     """Error of the deformation against the time of a whole run; beside it orders in space and time; PNG and PDF."""
     good = [p for p in usable(points) if p.series != "solver"]
     with paper_style():
-        figure, ax, space, time = _one_and_two(1.7)
+        figure, ax, space, time = _one_and_two()
         for line in series_of(sorted(good, key=lambda p: p.steps)).values():
             _curve(ax, line, **_look(line[-1]), **THIN)
         for last in (line[-1] for line in on_meshes(good).values() if line[-1].refine != "off"):
@@ -298,44 +295,3 @@ def _basis_lines(row: Any, line: Sequence[ReducedRiccatiPoint], y: str, style: d
     for ax, x, look in zip(row, ("N", "seconds"), (style, marks), strict=True):
         _curve(ax, inside, x, y, **look)
         _curve(ax, above, x, y, **marks, **EDGE)
-
-
-def figure_loop(points: Sequence[LoopPoint], error: float | None, out_png: Path) -> tuple[Path, ...]:
-    """Error of the trajectory against time, error in time against the steps, time of a step; PNG and PDF."""
-    lines = series_of(points)
-    gains = list(dict.fromkeys((p.basis, p.N) for p in points))
-    with paper_style():
-        figure, ax, order, step = _one_and_two(1.5)
-        handles = []
-        for k, (name, every) in enumerate(lines.items()):
-            first, line = every[0], usable(every)
-            style: dict[str, Any] = {
-                "color": GAIN_COLOURS[gains.index((first.basis, first.N)) % len(GAIN_COLOURS)],
-                "ls": "--" if first.held else "-", "marker": "s" if first.held else "o", "ms": 3.4, "mew": 0.9,
-                "lw": 0.8, "mfc": "none" if first.reduced_plant else None,
-            }  # fmt: skip
-            handles.append(_handle(name, **style))
-            _curve(ax, line, **style)
-            if not first.reduced_plant:
-                _curve(order, line, "steps", "error_time", **style)
-            per_step = [p.per_step for p in line]
-            if per_step:
-                step.plot([min(per_step), max(per_step)], [-k, -k], color=style["color"], lw=0.8)
-                step.plot([np.median(per_step)], [-k], **(style | {"ls": ""}))
-        front = _front(ax, points)
-        _axes_log(ax, "time of a run [s]", DEFORMATION)
-        _axes_log(order, "time steps", "error in time")
-        _steps_axes(step, list(lines))
-        figure.legend(handles=handles + _band(ax, error) + front, loc="outside upper center", ncols=3)
-        return save(figure, out_png)
-
-
-def _steps_axes(ax: Any, names: Sequence[str]) -> None:
-    """Time of a step of every controller, in the order of the legend."""
-    ax.set(xscale="log", xlabel="time of a step [s]")
-    ax.grid(color="#e6e6e6", lw=0.5)
-    ax.set_axisbelow(True)
-    ax.axvline(TICK, **LINE)
-    ax.annotate("1 ms", (TICK, 0.6), (-3, 0), textcoords="offset points", fontsize=6.5, color="#D00000", ha="right")
-    ax.set_yticks([-k for k in range(len(names))], names, fontsize=6)
-    ax.set_ylim(-len(names) + 0.4, 1.0)

@@ -9,15 +9,14 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.study.precision.settings import Refine, Setting
 from softgrasp.study.report.files import to_json
 
-QUESTIONS = ("forward", "reduced", "bases", "riccati", "reduced_riccati", "loop")
-CONTROL = ("riccati", "reduced_riccati", "loop")  # of these, the ones about feedback
+QUESTIONS = ("forward", "reduced", "bases", "riccati", "reduced_riccati")
+CONTROL = ("riccati", "reduced_riccati")  # of these, the ones about feedback
 TITLES = {
     "forward": "Full model: mesh, order, time step, solver",
     "reduced": "Reduced models: basis and N",
     "bases": "Bases: engine and tolerance",
     "riccati": "Riccati equation: method and tolerance",
     "reduced_riccati": "Reduced Riccati equation: basis and N",
-    "loop": "Closed loop: controller and step",
 }
 
 
@@ -195,27 +194,3 @@ class ReducedRiccatiPoint(WorkPoint):
     time_lift: float  # seconds to project the equation and to lift its gain
     time_basis: float  # seconds of the basis, all orders together
     scratch: float  # seconds with everything before it
-
-
-@dataclass(frozen=True, kw_only=True)
-class LoopPoint(WorkPoint):
-    """A closed loop with one controller and step."""
-
-    question: ClassVar[str] = "loop"
-    # steps, dt: of the run
-    steps: int
-    dt: float
-    # basis, N: of the gain; an empty basis is the optimal gain
-    basis: str
-    N: int
-    held: bool  # sampled at the start of every step and held, else inside the midpoint rule
-    reduced_plant: bool  # on the reduced plant that the gain was made for
-    reason: str = ""  # why the loop has no error
-    # per_step, setup: seconds
-    per_step: float
-    error_displacement: float  # of the outputs against the optimal loop, over the way to go
-    error_time: float  # of the deformation against the same gain without time step
-    cost_error: float
-    setup: float | None = None
-    # cost, cost_error: of the run, and how far from the optimal one [1]
-    cost: float | None = None

@@ -89,24 +89,13 @@ class ReducedReference:
 
 
 @dataclass(frozen=True)
-class LoopReference:
-    """The optimal loop without a time step."""
-
-    error: float | None  # change of the outputs with half of the modes
-    modes: int  # of the tissue
-    complete: bool  # all there are
-    optimal: float  # cost from the scene's start
-    to_come: float  # of it, after the end of the run
-
-
-@dataclass(frozen=True)
 class Question:
     """One question of a study."""
 
     points: tuple[WorkPoint, ...] = ()  # measured
     slopes: tuple[Slope, ...] = ()  # fitted to them
     # what the points are compared with; of reduced models and bases, the full run behind them
-    reference: ReferenceSolution | TimedRun | RiccatiReference | ReducedReference | LoopReference | None = None
+    reference: ReferenceSolution | TimedRun | RiccatiReference | ReducedReference | None = None
     skipped: str = ""  # why there are no points; empty when there are some
 
     @property
@@ -240,7 +229,7 @@ class WorkStudy:
         references = {
             name: q.reference
             for name, q in self.questions.items()
-            if isinstance(q.reference, RiccatiReference | ReducedReference | LoopReference)
+            if isinstance(q.reference, RiccatiReference | ReducedReference)
         }
         result: dict[str, Any] = to_json(
             {

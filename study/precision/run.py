@@ -23,7 +23,6 @@ from softgrasp.study.precision.answer import Answers
 from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.forward import SHARES, ask_forward, mesh_series, solver_settings
 from softgrasp.study.precision.full import FullRuns, find_places
-from softgrasp.study.precision.loop import CONTROLLERS, ask_loop
 from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RunPoint
 from softgrasp.study.precision.predict import Predictor, error_budget
 from softgrasp.study.precision.reduced import ReducedRuns, ask_bases, ask_reduced
@@ -177,9 +176,9 @@ def error_budgets(
 
 
 def control_questions(control: ControlRuns, names: Sequence[str]) -> dict[str, Question]:
-    """Riccati equation, reduced equations, closed loop; one that fails is left out with its reason. Collective."""
+    """Riccati equation and reduced equations; one that fails is left out with its reason. Collective."""
     questions = {}
-    asks = {"riccati": ask_riccati, "reduced_riccati": ask_reduced_riccati, "loop": ask_loop}
+    asks = {"riccati": ask_riccati, "reduced_riccati": ask_reduced_riccati}
     for name, ask in asks.items():
         if name in names:
             try:
@@ -198,7 +197,6 @@ def count_points(scene: Scene, control: ControlRuns, names: Sequence[str]) -> in
         "bases": 1 + len(ENGINES),
         "riccati": 1 + len(settings_of(control)),
         "reduced_riccati": 1 + len(BASES),
-        "loop": 1 + CONTROLLERS,
     }
     truth = len(LADDER) if set(names) - set(CONTROL) else 0
     return truth + sum(counts[name] for name in names) or 1

@@ -16,7 +16,6 @@ from softgrasp.study.precision.points import (
     TITLES,
     BasisPoint,
     ForwardPoint,
-    LoopPoint,
     ReducedPoint,
     ReducedRiccatiPoint,
     RiccatiPoint,
@@ -25,7 +24,6 @@ from softgrasp.study.precision.points import (
 )
 from softgrasp.study.precision.result import (
     ErrorBudget,
-    LoopReference,
     Question,
     ReducedReference,
     RiccatiReference,
@@ -79,11 +77,6 @@ COLUMNS: dict[str, dict[str, str | Callable[[Any], Any]]] = {
         "basis": _title, "N": "N", "gain error": "error", "excess cost": "cost_excess",
         "abscissa [1/s]": "abscissa_full", "equation [ms]": lambda p: 1e3 * p.seconds, "from nothing [s]": "scratch",
     },
-    "loop": {
-        "controller": _title, "steps": "steps", "deform. error": "error", "displ. error": "error_displacement",
-        "error in time": "error_time", "error of the cost": "cost_error", "step [us]": lambda p: 1e6 * p.per_step,
-        "run [s]": "seconds",
-    },
 }  # fmt: skip
 
 
@@ -112,8 +105,6 @@ def _why(p: WorkPoint) -> str:
             return "not reached"
         case ReducedRiccatiPoint():
             return "no solution" if p.reason else "unstable" if p.certified else "not certified"
-        case LoopPoint():
-            return "lost" if p.reason else "full plant not stable"
     return "missed" if isinstance(p, BasisPoint) else "unstable"
 
 
@@ -175,13 +166,6 @@ CAPTIONS = {
         "scene's start, against N and against the time of the reduced equation alone. Marks on the upper edge: error "
         "above 1; crosses: the full closed loop is not stable, or not certified to be."
     ),
-    "loop": (
-        "Left: largest error of the deformation, the outputs against the hand, against the optimal loop without any "
-        "time step, over its largest deformation; along a line the step falls. Solid: feedback inside the midpoint "
-        "rule; dashed: sampled at every step and held; open marks: the reduced plant instead of the full one. Upper "
-        "right: error against the same gain without time step. Steps longer than a period of the tissue do not resolve "
-        "what the start excites. Lower right: seconds of a step, range over all steps and median."
-    ),
 }
 
 
@@ -208,10 +192,4 @@ def reference_text(question: Question, paper: bool) -> str:
             text += f". The optimal cost from the scene's start is {r.optimal:.6g}."
             theirs = f" The paper: {1e3 * PAPER_SMALL:.0f} ms at N = {PAPER_N} with the POD of P, on its own machine."
             return text + (theirs if paper else "")
-        case LoopReference() as r:
-            own = f"all {r.modes} modes, exact but for rounding"
-            if not r.complete:
-                own = f"the {r.modes} lowest modes; with half of them the outputs change by {r.error:.1e}"
-            text = f"Reference: the optimal loop by the matrix exponential on {own}."
-            return f"{text} Limits and delay of the scene are left out; held means one sample a step."
     return ""

@@ -78,8 +78,9 @@ def run_query(
         raise SceneError(f"--csv {out}: {why}; name a file in a folder that is there")
     own = parse_settings(settings)
     questions = [own] if batch is None else [{**own, **row} for row in read_batch(batch)]
-    if not h5py.is_hdf5(path):
-        what = "is no HDF5 file" if path.is_file() else "is a folder" if path.is_dir() else "is not there"
+    if not (path.is_file() and h5py.is_hdf5(path)):
+        other = "is a folder" if path.is_dir() else "is a pipe" if path.exists() else "is not there"
+        what = "is no HDF5 file" if path.is_file() else other
         raise SceneError(f"{path} {what}; name the certified model that softgrasp reduce SCENE --tolerance wrote")
     model = load_certified(path)
     many = [materials_of(model, setting) for setting in questions]

@@ -17,15 +17,10 @@ from softgrasp.study.shell.session import Flags, Session
 
 def check_scene(scene: Scene) -> tuple[str, ...]:
     """Methods of the scene. Raises SceneError: it keeps no snapshots for a basis. BasisError: a method is unknown."""
-    if scene.output.snapshots != "memory":
+    if scene.output.snapshots not in ("auto", "memory"):
         raise SceneError(
             f"output.snapshots is '{scene.output.snapshots}'; it must be 'memory' for a reduction, which builds its "
             "bases from the states in memory"
-        )
-    if scene.effects.reaction and scene.output.every != 1:
-        raise SceneError(
-            f"output.every is {scene.output.every}; it must be 1 with effects.reaction, because the force on the hand "
-            "needs every state"
         )
     return measure.chosen_methods(scene.reduction)
 

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem.errors import SceneError, no_pipe
 from softgrasp.fem.mesh.check import counted
+from softgrasp.fem.scene.text import LARGEST, parse_toml, read_text
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import command_line
 from softgrasp.study.report.page import Section, write_report
@@ -27,21 +28,33 @@ ALIKE = 1e-12  # relative difference below which two numbers count as equal: rou
 LONGEST = 6  # entries of a list that is compared entry by entry
 
 
-def runs_below(folder: Path) -> Table:
-    """One row a run, the newest last. Raises SceneError: the folder does not exist."""
+def runs_below(folder: Path) -> tuple[Table, list[Path]]:
+    """One row a run, the newest last, and each ``result.json`` that is damaged or of another program.
+
+    Raises SceneError: the folder does not exist.
+    """
     if not folder.is_dir():
         raise SceneError(f"{folder}: there is no such folder; runs write into out/SCENE-COMMAND or where --out says")
-    files = sorted(folder.rglob("result.json"), key=lambda file: file.stat().st_mtime)
     header = ("folder", "command", "scene", "n_e", "total [s]", "warnings", "ended")
-    rows = [
-        (
-            str(file.parent), r["command"], r.get("scene", ""), r.get("n_e"), r.get("time", {}).get("total"),
-            len(r.get("warnings", ())), time.strftime("%Y-%m-%d %H:%M", time.localtime(file.stat().st_mtime)),
-        )
-        for file in files
-        if (r := read_result(file.parent))
-    ]  # fmt: skip
-    return Table(header, rows)
+    found, foreign = [], []
+    for file in folder.rglob("result.json"):
+        if not (r := read_result(file.parent)):
+            foreign.append(file)
+            continue
+        n_e, clock, warnings = r.get("n_e"), r.get("time"), r.get("warnings")
+        seconds, ended = clock.get("total") if isinstance(clock, dict) else None, file.stat().st_mtime
+        row = (
+            str(file.parent), r["command"], str(r.get("scene", "")), n_e if _number(n_e) else None,
+            seconds if _number(seconds) else None, len(warnings) if isinstance(warnings, list) else 0,
+            time.strftime("%Y-%m-%d %H:%M", time.localtime(ended)),
+        )  # fmt: skip
+        found.append((ended, row))
+    return Table(header, [row for _, row in sorted(found, key=lambda pair: pair[0])]), sorted(foreign)
+
+
+def _number(value: Any) -> bool:
+    """Whether a table can show it."""
+    return type(value) in (int, float) and abs(value) < LARGEST
 
 
 def flat(data: Any, at: str = "") -> Iterator[tuple[str, Any]]:
@@ -71,10 +84,10 @@ def compare(a: Path, b: Path) -> Comparison:
     results = []
     for folder in (a, b):
         if not (result := read_result(folder)):
-            raise SceneError(f"{folder}: there is no result.json of a run in this folder; `softgrasp list` shows them")
-        results.append(dict(flat(result)))
-    files = [folder / "scene.toml" for folder in (a, b)]
-    scenes = [dict(flat(tomllib.loads(file.read_text()) if file.exists() else {})) for file in files]
+            what = "holds no result of softgrasp" if (folder / "result.json").exists() else "is not there"
+            raise SceneError(f"{folder}/result.json {what}; name folders that `softgrasp list` shows")
+        results.append(_flat(folder / "result.json", result))
+    scenes = [_scene(folder / "scene.toml") for folder in (a, b)]
     names = list(dict.fromkeys([*scenes[0], *scenes[1]]))
     keys = [
         (name, *(str(s.get(name, "-")) for s in scenes)) for name in names if scenes[0].get(name) != scenes[1].get(name)
@@ -82,7 +95,7 @@ def compare(a: Path, b: Path) -> Comparison:
     numbers = []
     for name, x in results[0].items():
         y: Any = results[1].get(name)
-        if type(x) in (int, float) and type(y) in (int, float):
+        if _number(x) and _number(y):
             change = abs(y - x) / max(abs(x), abs(y)) if x != y else 0.0
             if change > ALIKE:
                 numbers.append((name, x, y, y / x - 1 if x else None))
@@ -92,18 +105,57 @@ def compare(a: Path, b: Path) -> Comparison:
     )
 
 
+def _flat(file: Path, data: dict[str, Any]) -> dict[str, Any]:
+    try:
+        return dict(flat(data))
+    except RecursionError:
+        raise SceneError(f"{file} has too many brackets in each other; run the scene again") from None
+
+
+def _scene(file: Path) -> dict[str, Any]:
+    """The keys of a scene; none where there is no file. Raises SceneError: it is damaged."""
+    if not file.exists():
+        return {}
+    try:
+        return _flat(file, parse_toml(read_text(file)))
+    except OSError as error:
+        raise SceneError(f"{file} cannot be read ({error.strerror}); run the scene again") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{file} is damaged ({error}); run the scene again") from None
+    except ValueError as error:
+        raise SceneError(f"{file} {error}; run the scene again") from None
+
+
 def _traces(a: Path, b: Path) -> tuple[list[str], np.ndarray, np.ndarray] | None:
     """Shared columns of both trajectory.csv, time first and velocities left out."""
     tables = []
     for folder in (a, b):
         if not (folder / "trajectory.csv").exists():
             return None
-        with (folder / "trajectory.csv").open(newline="") as file:
-            header, *rows = csv.reader(file)
-        tables.append((header, np.array(rows, dtype=float)))
+        tables.append(_trajectory(folder / "trajectory.csv"))
     shared = [name for name in tables[0][0] if name in tables[1][0] and "/s]" not in name]
     columns = [rows[:, [header.index(name) for name in shared]] for header, rows in tables]
     return shared, columns[0], columns[1]
+
+
+def _trajectory(file: Path) -> tuple[list[str], np.ndarray]:
+    """Labels and numbers of a table. Raises SceneError: it is damaged."""
+    try:
+        with no_pipe(file).open(newline="", encoding="utf-8") as lines:
+            header, *cells = csv.reader(lines)
+        rows = np.array(cells, dtype=float)
+        good = header[:1] == ["t [s]"] and rows.shape == (len(cells), len(header)) and len(rows) > 0
+        if good:
+            known = np.abs(rows) < LARGEST
+            known[0, [name.startswith("force") for name in header]] = True  # a force is of the step that ends there
+            good = bool(known.all() and (np.diff(rows[:, 0]) > 0).all())
+    except OSError as error:
+        raise SceneError(f"{file} cannot be read ({error.strerror}); run the scene again") from None
+    except (ValueError, csv.Error):
+        good = False
+    if not good:
+        raise SceneError(f"{file} is damaged: it is no table of finite numbers with growing times; run the scene again")
+    return header, rows
 
 
 def apart(traces: tuple[list[str], np.ndarray, np.ndarray] | None) -> str:
@@ -114,7 +166,7 @@ def apart(traces: tuple[list[str], np.ndarray, np.ndarray] | None) -> str:
     if a.shape != b.shape or not np.allclose(a[:, 0], b[:, 0]):
         return "The trajectories have other time steps; the picture shows both."
     most: dict[str, float] = {}
-    for name, size in zip(names[1:], np.abs(a - b).max(axis=0)[1:], strict=True):
+    for name, size in zip(names[1:], np.nanmax(np.abs(a - b), axis=0)[1:], strict=True):
         unit = name.rpartition("[")[2].rstrip("]")
         most[unit] = max(most.get(unit, 0.0), float(size))
     return f"The trajectories differ by at most {' and '.join(f'{size:.2g} {unit}' for unit, size in most.items())}."

@@ -14,7 +14,7 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.study.report.origin import origin
 from softgrasp.study.report.page import SHOWN, Section, cell_text
 from softgrasp.study.report.tables import Table
-from softgrasp.study.runs.sweep import METHOD, Sweep, SweepPoint, parse_axis, run_sweep_points
+from softgrasp.study.runs.sweep import METHOD, Sweep, SweepPoint, parse_axes, run_sweep_points
 from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
 
@@ -83,9 +83,8 @@ def run_sweep(
     Points are kept in ``out``; the same command after an interruption goes on from there. Raises SoftgraspError.
     """
     session = Session("sweep", path, overrides, out, console, quiet, pictures, empty)
+    sweep = Sweep(path, overrides, parse_axes(axes), reduced)
     scene, comm = session.scene(), session.comm
-    sweep = Sweep(path, overrides, tuple(parse_axis(text) for text in axes), reduced)
-    out.mkdir(parents=True, exist_ok=True)
     with session.progress(MofNCompleteColumn()) as bar:
         task = bar.add_task("points", total=len(sweep.points()))
         points = run_sweep_points(sweep, out, comm, each, lambda n, total: bar.update(task, completed=n, total=total))

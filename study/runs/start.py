@@ -84,13 +84,16 @@ def new_scene(file: Path, *, solid: bool = False, mesh: Path | None = None) -> l
     )  # fmt: skip
     file.parent.mkdir(parents=True, exist_ok=True)
     schema = file.with_name(SCHEMA)
-    file.write_text(text)
+    fresh = [path.with_name(f"new-{path.name}") for path in (file, schema)]
     try:
-        load_scene(file)
-    except SceneError:
-        file.unlink()
-        raise
-    schema.write_text(json.dumps(scene_schema(), indent=1) + "\n")
+        fresh[0].write_text(text)
+        load_scene(fresh[0])
+        fresh[1].write_text(json.dumps(scene_schema(), indent=1) + "\n")
+        for written, place in zip(fresh, (file, schema), strict=True):
+            written.replace(place)
+    finally:  # of what was not written whole
+        for written in fresh:
+            written.unlink(missing_ok=True)
     return [file, schema]
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +16,10 @@ from mpi4py import MPI
 
 from softgrasp import package_version
 from softgrasp.fem.accuracy import adapt
-from softgrasp.fem.errors import Interrupted, SceneError, SoftgraspError
+from softgrasp.fem.errors import Interrupted, SceneError, SoftgraspError, shortened
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
+from softgrasp.fem.owned import note, remove_own
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.file import load_scene
@@ -26,6 +29,7 @@ from softgrasp.reduction.reduce import reduce_linear
 from softgrasp.reduction.replay import errors_linear, full_run, replay_linear
 
 METHOD = "craig_bampton"  # needs no snapshots of the other values, and is stable at all of them
+MOST = 100_000  # points: each is a run
 FORM = "write KEY=FIRST:LAST:COUNT, KEY=FIRST:LAST:COUNT:log or KEY=A,B,C, as in tissue.material.mu=100:500:9"
 
 
@@ -47,15 +51,30 @@ def parse_axis(text: str) -> SweepAxis:
             values = [float(word) for word in right.split(",")]
         else:
             first, last, count = float(parts[0]), float(parts[1]), int(parts[2])
+            if count > MOST:
+                raise SceneError(
+                    f"'{shortened(text)}' has {shortened(str(count))} values; a sweep has at most {MOST} points"
+                )
             with np.errstate(all="ignore"):
                 values = [float(x) for x in (np.geomspace if log else np.linspace)(first, last, count)]
         good = bool(key) and len(parts) - log in (1, 3) and bool(np.isfinite(values).all()) and len(values) > 0
     except (ValueError, IndexError):
         good = False
     if not good:
-        raise SceneError(f"'{text}' is no sweep; {FORM}")
+        raise SceneError(f"'{shortened(text)}' is no sweep; {FORM}")
     whole = all(x == int(x) for x in values) and "." not in right and "e" not in right.lower()
     return SweepAxis(key, tuple(int(x) for x in values) if whole else tuple(values), log)
+
+
+def parse_axes(texts: Sequence[str]) -> tuple[SweepAxis, ...]:
+    """:func:`parse_axis` of every text. Raises SceneError: also where a key stands twice, or for too many points."""
+    axes = tuple(parse_axis(text) for text in texts)
+    keys = [axis.key for axis in axes]
+    if twice := next((shortened(key) for key in keys if keys.count(key) > 1), None):
+        raise SceneError(f"{twice} is swept twice; give all its values at once, as in {twice}=1,2,5")
+    if (count := math.prod(len(axis.values) for axis in axes)) > MOST:
+        raise SceneError(f"the sweep has {count} points; give at most {MOST}, by fewer values")
+    return axes
 
 
 @dataclass(frozen=True)
@@ -164,7 +183,7 @@ def run_sweep_points(
     """
     points = sweep.points()
     scenes = [sweep.scene(values) for values in points]
-    keys = [f"{scene_hash(scene)}-{sweep.N}-{package_version()}" for scene in scenes]
+    keys = _keys(sweep, scenes)
     done: dict[str, SweepPoint] = comm.bcast(
         _read(out, dict(zip(keys, points, strict=True))) if comm.rank == 0 else None
     )
@@ -178,14 +197,18 @@ def run_sweep_points(
         try:
             point = SweepPoint(points[i], runner.numbers(scenes[i], with_error=i in (0, len(points) - 1)))
         except Interrupted:
-            raise
+            if group.rank == 0:
+                remove_own(out, runner.out)  # nothing goes on within a point
+            at = ", ".join(f"{key} = {value:g}" for key, value in points[i].items())
+            raise Interrupted(f"stopped at {at}; the same command goes on from there") from None
         except SoftgraspError as error:
             own[keys[i]] = SweepPoint(points[i], {}, str(error))
         else:
             own[keys[i]] = point
             if group.rank == 0:
+                note(file)
                 with file.open("a") as lines:
-                    lines.write(json.dumps({"key": keys[i], "row": point.row()}) + "\n")
+                    lines.write(json.dumps(_sealed(keys[i], point.numbers)) + "\n")
         progress(min(len(points), len(points) - len(missing) + count * groups), len(points))
     for part in comm.allgather(own):
         done |= part
@@ -193,16 +216,31 @@ def run_sweep_points(
     return [done[key] for key in keys]
 
 
+def _keys(sweep: Sweep, scenes: Sequence[Scene]) -> list[str]:
+    return [f"{scene_hash(scene)}-{sweep.N}-{package_version()}" for scene in scenes]
+
+
+def read_points(sweep: Sweep, out: Path) -> dict[str, SweepPoint]:
+    """The points of a sweep that earlier calls have left in a folder. Not collective."""
+    points = sweep.points()
+    return _read(out, dict(zip(_keys(sweep, [sweep.scene(values) for values in points]), points, strict=True)))
+
+
+def _sealed(key: str, numbers: dict[str, float | None]) -> dict[str, Any]:
+    """The line of a point, with the SHA-256 of what it says."""
+    return {"key": key, "numbers": numbers, "sha256": hashlib.sha256(json.dumps([key, numbers]).encode()).hexdigest()}
+
+
 def _read(out: Path, points: dict[str, dict[str, float]]) -> dict[str, SweepPoint]:
-    """Which of these points earlier calls have run; a line that was cut off is no point."""
+    """Which of these points earlier calls have run; a line that is not what was written is no point."""
     done = {}
     for file in sorted(out.glob("points-*.jsonl")):
-        for line in file.read_text().splitlines():
+        for line in file.read_text(errors="replace").splitlines() if file.is_file() else ():
             try:
                 entry = json.loads(line)
-            except ValueError:
+                key, numbers = entry["key"], entry["numbers"]
+                if entry == _sealed(key, numbers) and key in points:
+                    done[key] = SweepPoint(points[key], numbers)
+            except (ValueError, TypeError, KeyError, RecursionError):
                 continue
-            if (values := points.get(entry["key"])) is not None:
-                numbers = {name: x for name, x in entry["row"].items() if name not in values}
-                done[entry["key"]] = SweepPoint(values, numbers)
     return done

@@ -54,6 +54,16 @@ def check_words(words: Sequence[str]) -> None:
             raise SceneError(f"{word}: this argument is not text here; rename the file or set LC_ALL=C.UTF-8")
 
 
+def no_compiler(error: BaseException) -> str:
+    """A sentence where DOLFINx could not compile a form for want of a C compiler, else nothing."""
+    if type(error).__module__.partition(".")[0] == "cffi" or "JIT compilation" in str(error):
+        last = (str(error).strip().splitlines() or [""])[-1]
+        return one_line(
+            f"a form cannot be compiled ({last}); install a C compiler or name one in CC, see softgrasp doctor"
+        )
+    return ""
+
+
 def run_command(command: Callable[[], object]) -> None:
     """Run a command line to its end. Collective."""
     outlive_readers()
@@ -73,7 +83,10 @@ def run_command(command: Callable[[], object]) -> None:
         sys.stderr.write(f"error: {reason}\n")
         end_all()
         sys.exit(1)
-    except BaseException:
+    except BaseException as error:
+        if reason := no_compiler(error):  # DOLFINx tells it to all ranks
+            sys.stderr.write(f"error: {reason}\n" * (rank() == 0))
+            sys.exit(1)
         traceback.print_exc()
         end_all()
         sys.exit(2)

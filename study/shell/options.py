@@ -15,13 +15,15 @@ import typer
 from softgrasp.fem.errors import SceneError
 
 
-def check_folder(out: Path | None) -> Path | None:
-    """Refuse a folder that cannot be one before anything is computed."""
-    if out is not None:
-        there = next(path for path in (out, *out.absolute().parents) if path.exists())
-        if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
-            why = "cannot be written to" if there.is_dir() else "is a file"
-            raise SceneError(f"--out {out}: {there} {why}; name a folder, which is made if it is missing")
+def parse_folder(text: str) -> Path:
+    """The folder of ``--out``; refused before anything is computed if it cannot be one."""
+    if not text.strip():
+        raise SceneError("--out is empty; name a folder, which is made if it is missing, or . for this one")
+    out = Path(text)
+    there = next(path for path in (out, *out.absolute().parents) if path.exists())
+    if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+        why = "cannot be written to" if there.is_dir() else "is a file"
+        raise SceneError(f"--out {out}: {there} {why}; name a folder, which is made if it is missing")
     return out
 
 
@@ -57,14 +59,14 @@ def _scenes(start: str) -> list[str]:
 
 
 OVERRIDE = "override a scene key, e.g. --set tissue.cells=[40,80]; may be repeated"
-EMPTY = "first remove the results that an earlier run has left in the folder"
+EMPTY = "first remove the files that earlier runs have left in the folder, by its own list"
 FOLDER = "folder for result.json, tables, pictures and report.html; out/SCENE-COMMAND if it is not given"
 SHARED: dict[str, tuple[Any, Any]] = {  # type, and what typer shows
     "scene": (
         Path,
         typer.Argument(..., help="scene file (TOML); `softgrasp scenes` lists those that ship", autocompletion=_scenes),
     ),
-    "out": (Path | None, typer.Option(None, "--out", "-o", help=FOLDER, callback=check_folder)),
+    "out": (Path | None, typer.Option(None, "--out", "-o", help=FOLDER, parser=parse_folder, metavar="FOLDER")),
     "set_": (list[str] | None, typer.Option(None, "--set", "-s", help=OVERRIDE)),
     "quiet": (bool, typer.Option(False, "--quiet", help="no progress bar")),
     "pictures": (bool, typer.Option(True, " /--no-pictures", show_default=False, help="numbers and fields only")),

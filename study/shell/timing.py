@@ -48,15 +48,18 @@ def warm(count: int) -> int:
     return max(1, count // 20)
 
 
-def interleave(methods: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
+def interleave(
+    methods: Mapping[str, Callable[[], float]], repeats: int, most: Mapping[str, int] | None = None
+) -> dict[str, list[float]]:
     """Call every method once a repeat, in rotated order, so that noise hits all alike; what each returned.
 
-    Collective if the methods are.
+    Collective if the methods are. ``most``: calls of each after which it is left out; None leaves out none.
     """
     samples: dict[str, list[float]] = {name: [] for name in methods}
     for i in range(repeats):
         for name in rotated(methods, i):
-            samples[name].append(methods[name]())
+            if most is None or i < most[name]:
+                samples[name].append(methods[name]())
     return samples
 
 

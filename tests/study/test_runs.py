@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import json
+import os
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -23,7 +26,7 @@ from softgrasp.study.runs import sweep as sweep_module
 from softgrasp.study.runs.listing import apart, compare, run_compare, runs_below
 from softgrasp.study.runs.run import run_sweep, short_table
 from softgrasp.study.runs.start import SCHEMA, materials_table, new_scene
-from softgrasp.study.runs.sweep import SweepPoint, parse_axis
+from softgrasp.study.runs.sweep import SweepPoint, parse_axes, parse_axis
 
 SMALL = ["tissue.cells=[3,6]", "time.steps=60"]
 SCENE = shipped_scenes()["paper_forward"]
@@ -34,6 +37,14 @@ def test_a_sweep_says_its_values_or_its_form() -> None:
     assert parse_axis("time.steps=100:300:3").values == (100, 200, 300)
     assert parse_axis("a.b=1e1:1e3:3:log").values == pytest.approx((10, 100, 1000), rel=1e-15)
     assert parse_axis("a.b=20,0.5").values == (20.0, 0.5)
+    with pytest.raises(SceneError, match=r"a\.b is swept twice; give all its values at once"):
+        parse_axes(["a.b=1,2", "c.d=1", "a.b=5,6"])
+    for much in (["a.b=1:2:1000000000"], ["a.b=1:2:1000", "c.d=1:2:1000"]):
+        with pytest.raises(SceneError, match="at most 100000"):
+            parse_axes(much)
+    with pytest.raises(SceneError) as long:
+        parse_axis("a.b=1:2:" + "9" * 4000)
+    assert len(str(long.value)) < 300  # what was typed is not repeated whole
     for wrong in ("a.b=1:2", "a.b=1:2:3:4", "a.b=x", "=1,2", "a.b", "a.b=-1:2:3:log"):
         with pytest.raises(SceneError, match=r"no sweep; write KEY=FIRST:LAST:COUNT"):
             parse_axis(wrong)
@@ -116,7 +127,7 @@ def test_two_runs_are_listed_and_compared(tmp_path: Path) -> None:
     for name, mu in (("a", 50.0), ("b", 30.0)):
         changes = [*SMALL, f"tissue.material.mu={mu}"]
         run_simulate(SCENE, tmp_path / name, changes, QUIET, quiet=True, pictures=False)
-    assert [Path(row[0]).name for row in runs_below(tmp_path).rows] == ["a", "b"]
+    assert [Path(row[0]).name for row in runs_below(tmp_path)[0].rows] == ["a", "b"]
     comparison = compare(tmp_path / "a", tmp_path / "b")
     assert comparison.keys.rows == [("tissue.material.mu", "50.0", "30.0")]
     numbers = {row[0]: row[1:] for row in comparison.numbers.rows}
@@ -124,7 +135,7 @@ def test_two_runs_are_listed_and_compared(tmp_path: Path) -> None:
     assert numbers["output_final[0]"][:2] == tuple(r["output_final"][0] for r in results)
     assert "n_e" not in numbers
     assert not compare(tmp_path / "a", tmp_path / "a").numbers.rows
-    assert apart(compare(tmp_path / "a", tmp_path / "a").traces) == "The trajectories differ by at most 0 m."
+    assert apart(compare(tmp_path / "a", tmp_path / "a").traces) == "The trajectories differ by at most 0 m and 0 N."
     assert apart((["t [s]", "x [m]", "turn [rad]"], np.eye(3), np.diag([1.0, 3.0, -1.0]))) == (
         "The trajectories differ by at most 2 m and 2 rad."
     )
@@ -132,7 +143,7 @@ def test_two_runs_are_listed_and_compared(tmp_path: Path) -> None:
     assert (tmp_path / "c" / "compare.png").stat().st_size > 5000
     with (tmp_path / "c" / "compare.csv").open(newline="") as file:
         assert len(list(csv.reader(file))) == 1 + len(numbers)
-    with pytest.raises(SceneError, match=r"no result\.json"):
+    with pytest.raises(SceneError, match=r"result\.json is not there; name folders"):
         compare(tmp_path, tmp_path / "b")
     with pytest.raises(SceneError, match="no such folder"):
         runs_below(tmp_path / "none")
@@ -170,3 +181,44 @@ def test_the_schema_beside_the_shipped_scenes_is_current() -> None:
     shipped = json.loads((SCENE.parent / SCHEMA).read_text())
     assert shipped == scene_schema(), f"write it again: softgrasp schema > demos/scenes/{SCHEMA}"
     assert all(path.read_text().startswith(f"#:schema ./{SCHEMA}\n") for path in shipped_scenes().values())
+
+
+@pytest.mark.serial
+def test_a_foreign_result_does_not_end_the_list(tmp_path: Path) -> None:
+    """Whatever lies below a folder by that name, the runs of softgrasp are listed and the others named."""
+    good = {"command": "simulate", "scene": "strip", "time": {"total": 1.5}, "n_e": 10}
+    texts = (
+        json.dumps(good),
+        "[1]",
+        "{",
+        "\xff",
+        '{"command": 5}',
+        json.dumps({**good, "time": 3, "warnings": 7, "n_e": []}),
+    )
+    for i, text in enumerate(texts):
+        (tmp_path / str(i)).mkdir()
+        (tmp_path / str(i) / "result.json").write_text(text, encoding="latin-1")
+    (tmp_path / "6").mkdir()
+    (tmp_path / "6" / "result.json").symlink_to(tmp_path / "gone")
+    os.mkfifo(tmp_path / "6" / "pipe")
+    runs, foreign = runs_below(tmp_path)
+    assert {Path(row[0]).name for row in runs.rows} == {"0", "5"}
+    assert {file.parent.name for file in foreign} == {"1", "2", "3", "4", "6"}
+    with pytest.raises(SceneError, match=r"2/result\.json holds no result of softgrasp"):
+        compare(tmp_path / "0", tmp_path / "2")
+
+
+@pytest.mark.serial
+def test_a_new_scene_is_there_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = Path.write_text
+
+    def full(path: Path, text: str, **how: Any) -> int:
+        if "schema" not in path.name:
+            return write(path, text, **how)
+        write(path, text[:100])
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="No space left"):
+        new_scene(tmp_path / "my.toml")
+    assert list(tmp_path.iterdir()) == []

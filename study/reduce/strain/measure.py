@@ -27,6 +27,9 @@ MOTIONS = 4  # held out
 SHARES = (0.9, 0.6)  # of the scene's own move, held out from models that are trained on it alone
 RUNS, SETUPS = 31, 15  # behind each median of the online time and of the set-up
 
+Missed = tuple[float, float]
+"""Error of z on a held-out run, and the model's own estimate of it."""
+
 Place = tuple[float, float]
 """Lamé constants of the first layer [Pa]."""
 
@@ -143,45 +146,48 @@ def _family(
     tests = []
     for j, (kind, full) in enumerate(held):
         first, target = full.model.system.materials[0], tuple(full.trajectory.q_s[-1].tolist())
-        tests.append(HeldOutTest(kind, first.lam, first.mu, target, {N: missed[N][j] for N in models}))
+        errors, estimates = ({N: None if (pair := missed[N][j]) is None else pair[i] for N in models} for i in (0, 1))
+        tests.append(HeldOutTest(kind, first.lam, first.mu, target, errors, estimates))
     whole = (*curves, *points)
     return StrainFamily(key, training.whole.box, len(runs), tuple(points), whole, tuple(tests), models, refused)
 
 
 def _measure(
-    training: Training, rom: StrainModel, held: Sequence[HeldOut], missed: Sequence[float | None]
+    training: Training, rom: StrainModel, held: Sequence[HeldOut], missed: Sequence[Missed | None]
 ) -> StrainPoint:
     """Errors on training runs and on held-out ones, drift, times."""
     done = [replay_strain(rom, run, outside=True) for run in training.runs]
     trained = pooled_errors([r.missed(x.a, x.v) for r, x in zip(training.references, done, strict=True)])
     own = training.references[0].errors(done[0].a, done[0].v)
     worst: dict[str, list[float]] = {"material": [], "motion": []}
-    for (kind, _), error in zip(held, missed, strict=True):
-        worst[kind] += [] if error is None else [error]
+    for (kind, _), pair in zip(held, missed, strict=True):
+        worst[kind] += [] if pair is None else [pair[0]]
     full, comm = training.runs[0], training.model.system.layout.comm
     small = rom.at(full.dt, outside=True)  # few cells may overshoot
     start = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
     online = median_seconds(comm, lambda: small.run(full.hand, a0=start), RUNS)
     setup = median_seconds(comm, lambda: rom.at(full.dt).problem.potential.packed, SETUPS)
+    estimate = median_seconds(comm, lambda: replace(done[0]).error_estimate, SETUPS)  # a copy has not made its own
     return StrainPoint(
         N=rom.N, k=rom.k, tau=rom.tau, residual=rom.residual, cells=rom.cells.count,
         error_own=own.z, error_own_velocity=own.v, error_own_energy_norm=own.energy_norm,
-        error_training=trained.z, error_galerkin=rom.error_galerkin,
+        estimate_own=done[0].error_estimate, error_training=trained.z, error_galerkin=rom.error_galerkin,
         floor=training.references[0].projection_error(rom.k),
         error_materials=max(worst["material"], default=None), error_motions=max(worst["motion"], default=None),
         drift=max(run.energy_drift for run in done), evaluations=done[0].evaluations, engine=done[0].engine,
         time_offline=sum(rom.seconds.values()), time_setup=setup, time_online=online,
+        time_estimate=estimate,
     )  # fmt: skip
 
 
-def _missed(rom: StrainModel, held: Sequence[HeldOut], references: Sequence[Reference]) -> list[float | None]:
-    """Errors in z on held-out runs; None where the model refuses one or fails."""
-    errors: list[float | None] = []
+def _missed(rom: StrainModel, held: Sequence[HeldOut], references: Sequence[Reference]) -> list[Missed | None]:
+    """Errors and estimates on held-out runs; None where the model refuses one or fails."""
+    errors: list[Missed | None] = []
     for (_, full), reference in zip(held, references, strict=True):
         try:
             run = replay_strain(rom, full)
         except (ReductionError, SolverError):
             errors.append(None)
         else:
-            errors.append(reference.errors(run.a, run.v).z)
+            errors.append((reference.errors(run.a, run.v).z, run.error_estimate))
     return errors

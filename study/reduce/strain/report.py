@@ -22,8 +22,9 @@ CAPTIONS = {
 }
 NOTE = (
     "N counts the hand's 2 n_s, as for linear models. cells: those with a weight. own: error of z on the scene's own "
-    "run, which trained the model; energy: of (z, v) in the energy norm. all cells: error of z over the training runs "
-    "without sampling. new material, new motion: largest error of z on full runs inside the box that trained no model; "
+    "run, which trained the model; estimate: what the model says of it by itself, from its residual in twice the "
+    "columns, no bound; energy: of (z, v) in the energy norm. all cells: error of z over the training runs without "
+    "sampling. new material, new motion: largest error of z on full runs inside the box that trained no model; "
     "-: there are none, or the model refuses them. drift: of the model's own energy."
 )
 
@@ -43,10 +44,10 @@ def sections(study: StrainStudy, files: Sequence[Path]) -> list[Section]:
 
 def error_table(study: StrainStudy) -> Table:
     """One line for each family and N."""
-    header = ("runs", "N", "cells", "own", "energy", "all cells", "new material", "new motion", "drift")
+    header = ("runs", "N", "cells", "own", "estimate", "energy", "all cells", "new material", "new motion", "drift")
     rows = [
-        (f.runs, p.N, p.cells, *map(_short, (p.error_own, p.error_own_energy_norm, p.error_galerkin)),
-         *map(_short, (p.error_materials, p.error_motions)), f"{p.drift:.0e}")
+        (f.runs, p.N, p.cells, *map(_short, (p.error_own, p.estimate_own, p.error_own_energy_norm)),
+         _short(p.error_galerkin), *map(_short, (p.error_materials, p.error_motions)), f"{p.drift:.0e}")
         for f in study.families for p in f.points
     ]  # fmt: skip
     return Table(header, rows, "Errors")
@@ -71,10 +72,16 @@ def time_table(study: StrainStudy) -> Table:
 
 
 def test_table(family: StrainFamily) -> Table:
-    """Every held-out run with a column for each N."""
+    """Every held-out run with a column for each N: the error, and its estimate in brackets."""
     sizes = [p.N for p in family.points]
     rows = [
-        (t.kind, f"{t.lam:.4g}", f"{t.mu:.4g}", ", ".join(f"{x:.3g}" for x in t.target), *(t.errors[N] for N in sizes))
+        (
+            t.kind,
+            f"{t.lam:.4g}",
+            f"{t.mu:.4g}",
+            ", ".join(f"{x:.3g}" for x in t.target),
+            *(f"{_short(t.errors[N])} ({_short(t.estimates[N])})" for N in sizes),
+        )
         for t in family.tests
     ]
     return Table(("new", "lambda [Pa]", "mu [Pa]", "target [m]", *(f"N = {N}" for N in sizes)), rows)
@@ -109,6 +116,15 @@ def sentences(study: StrainStudy) -> list[str]:
         best = min(((statistics.median(e), N) for N, e in errors.items() if e), default=None)
         if best is not None:
             lines.append(f"Median error over {len(f.tests)} held-out runs: least at N = {best[1]}, {best[0]:.1e}.")
+        pairs = [(t.estimates[N], error) for t in f.tests for N, error in t.errors.items()]
+        ratios = [estimate / error for estimate, error in pairs if estimate is not None and error]
+        if ratios:
+            shares = [p.time_estimate / p.time_online for p in f.points]
+            lines.append(
+                f"The models estimate their own errors, an estimate and no bound: {min(ratios):.2g} to "
+                f"{max(ratios):.2g} times the true ones of {len(ratios)} held-out runs, in {min(shares):.2g} to "
+                f"{max(shares):.2g} times the time of a run."
+            )
         lines += [f"N = {N} refused: {reason}." for N, reason in f.refused.items()]
     if {p.engine for f in study.families for p in f.points} == {"NumPy"}:
         lines.append("No C compiler was found, so the reduced runs stepped in NumPy, about thirty times slower.")

@@ -25,6 +25,7 @@ class StrainPoint:
     error_own: float
     error_own_velocity: float
     error_own_energy_norm: float
+    estimate_own: float  # what the model itself estimates of ``error_own``
     error_training: float  # over all training runs
     error_galerkin: float  # the same of the model on all cells
     floor: float  # of the basis, on the scene's own run
@@ -37,6 +38,7 @@ class StrainPoint:
     time_offline: float  # basis, model on all cells, forces and weights, after the full runs
     time_setup: float  # time_setup, time_online: a new parameter before its run, and a run
     time_online: float
+    time_estimate: float  # of the error of a run, after it
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class HeldOutTest:
     mu: float
     target: tuple[float, ...]  # where the hand ends [m]
     errors: dict[int, float | None]  # in z by N; None where the model refuses the run or fails
+    estimates: dict[int, float | None]  # of them by N, made by the model without the full run
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from collections.abc import Callable
@@ -180,3 +181,20 @@ def test_a_full_disk_is_named_by_the_file(tmp_path: Path) -> None:
     """The device that is always full, through the real writer."""
     with pytest.raises(OSError, match="No space left"):
         write_arrays(Path("/dev/full"), {"x": np.zeros(100_000)})
+
+
+def test_room_that_is_gone_when_it_is_taken_ends_all_ranks(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As with a quota, which no question for free room shows: HDF5 itself would end the program."""
+    monkeypatch.setattr("softgrasp.fem.run.snapshots.check_room", lambda *_: None)
+
+    def refuse(file: int, at: int, size: int) -> None:
+        assert size > 0
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    if comm.rank == comm.size - 1:
+        monkeypatch.setattr("os.posix_fallocate", refuse)
+    model = build(make_scene(output=HDF5), comm=comm)
+    with pytest.raises(ResourceError, match=r"snapshots-rank\d\.h5 cannot be written .*quota"):
+        simulate(model, RunOptions(mpi_tmp_path))

@@ -203,6 +203,24 @@ def test_derivatives_of_the_reduced_energy() -> None:
     np.testing.assert_allclose(columns, potential.tangent(a), rtol=1e-6, atol=1e-6)
 
 
+@EACH_LAW
+@EACH_DIMENSION
+def test_many_states_at_once_are_those_one_by_one(law: LawName, d: int) -> None:
+    potential = Potential(cells_of(law, d), LAYERS)
+    a, w = 0.05 * np.random.default_rng(6).standard_normal((2, 3, potential.k))
+    steps = []
+    for each, half in zip(a, w, strict=True):
+        potential.begin(each)
+        steps.append(potential.discrete(half)[0])
+    np.testing.assert_allclose(potential.discrete_forces(a, w), steps, rtol=1e-12, atol=1e-13)  # sums in another order
+    np.testing.assert_allclose(potential.tangents(a), [potential.tangent(x) for x in a], rtol=1e-12, atol=1e-12)
+    assert law == "stvk" or np.isinf(potential.discrete_forces(a, 1e3 * w)).all()  # a cell folds
+
+
+def test_a_model_without_a_finer_space_gives_no_number() -> None:
+    assert np.isnan(model_of().at(0.01).run(hand_of(1.0)).error_estimate)
+
+
 @pytest.mark.parametrize("engine", ["C", "NumPy"])
 def test_a_run_that_folds_names_step_time_and_cell(engine: str) -> None:
     if engine == "C" and stepper.compiled() is None:

@@ -50,7 +50,7 @@ def ran(folder: Path, method: str) -> tuple[dict[str, Any], str]:
     text = io.StringIO()
     console = Console(file=text, width=160, quiet=MPI.COMM_WORLD.rank != 0)
     overrides = [*SMALL, f"control.method='{method}'"]
-    run_control(SCENES / "paper_lqr.toml", folder, overrides, console, quiet=True, pictures=False)
+    run_control(SCENES / "paper_lqr.toml", folder, overrides, console, quiet=True, pictures=False, retune=True)
     return json.loads((folder / "result.json").read_text()), text.getvalue()
 
 
@@ -276,9 +276,11 @@ HELD = "control.loop={{sampling='held',rate={rate},delay=true}}"
 FAST = ["tissue.cells=[2,4]", "time.end=10.0", "control.Q=1e4", "control.N=[4,6]", "output.fields='none'"]
 
 
-def quietly(out: Path, *overrides: str) -> dict[str, Any]:
+def quietly(out: Path, *overrides: str, retune: bool = False) -> dict[str, Any]:
     console = Console(file=io.StringIO(), quiet=MPI.COMM_WORLD.rank != 0)
-    return run_control(SCENES / "paper_lqr.toml", out, list(overrides), console, quiet=True, pictures=False)
+    return run_control(
+        SCENES / "paper_lqr.toml", out, list(overrides), console, quiet=True, pictures=False, retune=retune
+    )
 
 
 @pytest.mark.ranks(2)
@@ -292,7 +294,7 @@ def test_an_unstable_sampled_loop_writes_nothing_and_names_a_rate(tmp_path: Path
     assert "at 5 Hz and one tick late is unstable" in sentence
     rate, steps = re.findall(r"rate = ([\d.]+) with time.steps = (\d+)", sentence)[0]
     assert 9 < float(rate) < 12
-    found = quietly(out, *FAST, f"time.steps={steps}", HELD.format(rate=rate))
+    found = quietly(out, *FAST, f"time.steps={steps}", HELD.format(rate=rate), retune=True)
     assert found["closed_loop_abscissa"] < 0
     assert 0.99 < found["sampled_radius"] < 1
     assert found["sampled_certified"]

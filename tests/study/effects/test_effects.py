@@ -20,9 +20,12 @@ from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import ResourceError, SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.model.scales import rigid_inertia
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.study.effects import measure as effects_measure
+from softgrasp.study.effects.experiments import Displacements, Experiments, Names, compare, displacements
 from softgrasp.study.effects.measure import (
     MeasuredScene,
     bare_output,
@@ -35,23 +38,15 @@ from softgrasp.study.effects.measure import (
     read_table,
 )
 from softgrasp.study.effects.page import parts
-from softgrasp.study.effects.result import Change, EffectResult, EffectsStudy
+from softgrasp.study.effects.result import Change, Company, EffectResult, EffectsStudy
 from softgrasp.study.effects.run import check_variants, run_effects, study_effects
 from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, neutral, switches
-from softgrasp.study.effects.verdict import (
-    Displacements,
-    Experiments,
-    Names,
-    advised_together,
-    compare,
-    displacements,
-    finite_strain_beside,
-    verdict_of,
-)
+from softgrasp.study.effects.together import advised, advised_together, finite_strain_beside
+from softgrasp.study.effects.verdict import verdict_of
 from softgrasp.study.report.tables import show_sections
 from softgrasp.study.shell.timing import RepeatableRun
 from tests.helpers.browser import find_chromium, look
-from tests.helpers.models import LAYERS, gather_states, make_scene, write_scene
+from tests.helpers.models import LAYERS, close, gather_states, make_scene, write_scene
 
 QUICK = {"study": {"repeats": 1}, "time": {"steps": 20}}
 CONTROL = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0]}]}}
@@ -183,12 +178,12 @@ def test_damping_for_control_is_not_called_wasted(comm: MPI.Intracomm) -> None:
 # --- several switches at once
 
 
-class Trial:
+class Trial(Experiments):
     """Runs in which finite strain shows beside gravity by ``size``, or fails."""
 
     def __init__(self, size: float | None) -> None:
         self.on, self.size, self.asked = frozenset[str](), size, [Names()]
-        self.scene = make_scene()
+        self.scene, self.scales = make_scene(), SCALES
 
     def change(self, a: Names, b: Names) -> Change:
         self.asked.append(b)
@@ -239,8 +234,10 @@ class Table(Experiments):
     """Experiments whose outputs are a formula of the effects that are on."""
 
     def __init__(self, on: set[str], output: Callable[[Names], float], forced: Callable[[Names], float] | None) -> None:
-        self.on = frozenset(on)
+        self.on, self.scales = frozenset(on), SCALES
+        self.scene = make_scene(effects={name: ALL_ON[name] for name in on})
         self.force = None if forced is None else lambda n, t, q, v: q
+        self.runs = {}
         self.formulas = {False: output, True: forced or output}
 
     def of(self, on: Names, forced: bool = False) -> Displacements:
@@ -254,16 +251,100 @@ def test_pairs_that_hide_below_the_tolerance_one_by_one() -> None:
     def y(on: Names) -> float:
         return 1 + sum(1e-3 * sizes[name] for name in on)
 
-    off = advised_together(Table(set(), y, None), tried, frozenset(), 1e-3)
-    assert off.on == ("gravity", "damping")
-    assert off.company["gravity"].partners == ("damping",)
-    assert off.company["gravity"].together == pytest.approx(1.2e-3, rel=2e-3)  # relative to 1 + 1.2e-3
-    assert off.company["reaction"].partners == ()
-    on = advised_together(Table(set(tried), y, None), tried, frozenset(), 1e-3)
-    assert on.on == ("gravity",)  # one of both is enough
-    assert on.company["gravity"].either
-    assert on.company["damping"].partners == ()
-    assert advised_together(Table(set(), lambda on: y(on) - 1 + 1e3, None), tried, frozenset(), 1e-3).on == ()
+    on, company = advised_together(Table(set(), y, None), tried, frozenset(), 1e-3)
+    assert on == {"gravity", "damping"}
+    assert company["gravity"].partners == ("damping",)
+    assert company["gravity"].pair
+    assert company["gravity"].together == pytest.approx(1.2e-3, rel=2e-3)  # relative to 1 + 1.2e-3
+    assert company["reaction"].partners == ()
+    on, company = advised_together(Table(set(tried), y, None), tried, frozenset(), 1e-3)
+    assert on == {"gravity"}  # one of both is enough
+    assert company["gravity"].pair
+    assert company["damping"].partners == ()
+    assert not advised_together(Table(set(), lambda on: y(on) - 1 + 1e3, None), tried, frozenset(), 1e-3)[0]
+
+
+def named(runs: Experiments, name: str, company: Company) -> float:
+    """The change by what the advice names, from the runs of exactly these scenes."""
+    partners = frozenset(company.partners)
+    pair = partners | {name}
+    a, b = (runs.on - pair, runs.on | pair) if company.pair else (runs.on ^ partners, runs.on ^ pair)
+    x, y = (runs.of(on, company.forced).places for on in (a, b))
+    most = [np.linalg.norm(v, axis=2).max() for v in (x, y, x - y)]
+    return float(most[2] / max(most[:2]))
+
+
+@pytest.mark.parametrize("start", [{"gravity", "damping", "reaction"}, set(), {"damping", "reaction"}])
+@pytest.mark.parametrize("enough", [1, 2])
+def test_a_combination_has_the_number_of_what_its_advice_names(start: set[str], enough: int) -> None:
+    """One of gravity and damping, or both, hold the body: where reaction is off too it falls less."""
+
+    def y(on: Names) -> float:
+        return 1.0 if len(on & {"gravity", "damping"}) >= enough else 0.85 if "reaction" not in on else -0.23
+
+    runs = Table(start, y, None)
+    tried = ("gravity", "damping", "reaction")
+    needed = frozenset(name for name in tried if runs.change(runs.on, runs.on ^ {name}).outputs > 0.1)
+    _, company = advised_together(runs, tried, needed, 0.1)
+    joined = {name: found for name, found in company.items() if found.partners}
+    for name, found in joined.items():
+        assert found.among == ()
+        assert found.together == pytest.approx(named(runs, name, found), rel=1e-12)  # the same operations
+    if len(start) == 3 and enough == 1:
+        assert joined["gravity"].partners == ("damping",)
+        assert joined["gravity"].together == pytest.approx(1.23)  # not the 0.15 of a scene without reaction
+    if not start and enough == 2:
+        assert joined["gravity"].pair
+
+
+@pytest.mark.parametrize("sizes", [(0.5, 0.1), (0.1, 0.5)])
+def test_effects_that_the_scene_does_not_take_together_are_not_advised_together(sizes: tuple[float, float]) -> None:
+    names, rest = ("rotation", "finite_strain"), {"gravity": 0.2}
+
+    def y(on: Names) -> float:
+        return 1 + sum(({**dict(zip(names, sizes, strict=True)), **rest})[name] for name in on)
+
+    runs = Table(set(), y, None)
+    changes = {name: (runs.change(runs.on, runs.on ^ {name}), None) for name in ("gravity", *names)}
+    result = advised(runs, frozenset(changes), changes)
+    larger, smaller = sorted(names, key=lambda name: -sizes[names.index(name)])
+    assert set(result.on) == {"gravity", larger}
+    assert result.rivals[smaller].name == larger
+    assert "effects.finite_strain cannot go with effects.rotation" in result.rivals[smaller].why
+    assert runs.refusal(frozenset(result.on)) == ""
+    assert runs.refusal(frozenset(names)) == result.rivals[smaller].why
+
+
+@pytest.mark.ranks(2)
+def test_advice_on_a_shipped_scene_can_be_followed(comm: MPI.Intracomm) -> None:
+    """All of it together builds; each number of a combination is that of two runs of the scenes it names."""
+    small = ["tissue.cells=[4,8]", "time.steps=40", "study.repeats=1"]
+    scene = load_scene_collective(comm, "paper_forward", small)
+    study = study_effects(scene, comm)
+    model = build(scene, comm=comm)
+    runs = Experiments(scene, Scales(2, *rigid_inertia(model), None), {frozenset(): model})
+    assert {"gravity", "reaction", "finite_strain"} <= set(study.advised)
+    assert runs.refusal(frozenset(study.advised) - {"damping"}) == ""  # its trial value needs a frequency
+    by = {f.name: f for f in study.findings}
+    assert by["rotation"].advice.startswith("Switch it on only in place of finite_strain, which is advised: with reac")
+    assert "effects.finite_strain cannot go with effects.rotation" in by["rotation"].advice
+    joined = {f.name: f.company for f in study.findings if f.company is not None and f.company.partners}
+    assert joined
+    for name, company in joined.items():
+        assert company.together == pytest.approx(named(runs, name, company), rel=1e-9)  # parallel sums, other order
+
+
+@pytest.mark.ranks
+def test_a_prescribed_motion_feels_neither_reaction_nor_the_freedom_to_turn(comm: MPI.Intracomm) -> None:
+    """So runs that differ in them alone are made once, with all other effects on."""
+    model = build(make_scene(QUICK, hand={"inertia": 3.0}), comm=comm)
+    runs = Experiments(model.scene, SCALES, {frozenset(): model})
+    for base in (frozenset[str](), frozenset({"gravity", "damping"})):
+        plain = simulate(runs.model(base))
+        for more in ({"reaction"}, {"rotation"}, {"reaction", "rotation"}):
+            other = runs.model(base | more)
+            assert runs.shown(base | more, False) == base
+            assert close(simulate(other).outputs, plain.outputs) < 1e-12  # vectors of three columns round otherwise
 
 
 def test_an_effect_may_need_two_partners_and_a_force() -> None:
@@ -276,14 +357,15 @@ def test_an_effect_may_need_two_partners_and_a_force() -> None:
         return still(on) + 0.5 * ({"gravity", "reaction", "rotation"} <= on)
 
     needed = frozenset({"gravity", "reaction"})
-    found = advised_together(Table(set(), still, forced), tried, needed, 1e-2)
-    assert found.on == ("gravity", "reaction", "rotation")
-    assert found.company["rotation"].partners == ("gravity", "reaction")
-    assert found.company["rotation"].forced
-    assert found.company["rotation"].together == pytest.approx(0.5 / 1.7)
-    assert found.company["rotation"].change.outputs == 0
-    assert not advised_together(Table(set(), still, None), tried, needed, 1e-2).company["rotation"].forced
-    assert advised_together(Table(set(), still, None), tried, needed, 1e-2).on == ("gravity", "reaction")
+    on, company = advised_together(Table(set(), still, forced), tried, needed, 1e-2)
+    assert on == {"gravity", "reaction", "rotation"}
+    assert company["rotation"].partners == ("gravity", "reaction")
+    assert company["rotation"].forced
+    assert company["rotation"].together == pytest.approx(0.5 / 1.7)
+    assert company["rotation"].change.outputs == 0
+    on, company = advised_together(Table(set(), still, None), tried, needed, 1e-2)
+    assert on == {"gravity", "reaction"}
+    assert not company["rotation"].forced
 
 
 # --- numbers against independent ones

@@ -106,7 +106,7 @@ def test_paper_sizes(comm: MPI.Intracomm) -> None:
     result = explain(scene, comm)
     assert (result.sizes.n_s, result.sizes.n_e, result.sizes.states) == (2, 956, 1916)
     assert (result.sizes.cells, result.sizes.nodes) == (2 * 15 * 30, 16 * 31)
-    assert result.snapshot_bytes == 101 * 2 * 956 * 8
+    assert result.snapshot_bytes == 25 * 2 * 956 * 8  # of 101, those that the warnings take
     assert result.time.dt == 0.02
     omega = np.array(result.time.omega)
     np.testing.assert_array_equal(result.time.omega_dt, omega * 0.02)
@@ -225,10 +225,11 @@ def test_typical_gradient_leaves_out_a_hundredth_of_the_body(comm: MPI.Intracomm
 
 def test_digits_that_are_left() -> None:
     assert inexact(1e-12, 1e-14, "cholesky", 0.3) == []
-    assert inexact(1e-5, 1e-14, "cg", 0.3) == []  # of cg the residual counts
+    assert inexact(1e-12, 1e-4, "cg", 0.3) == []  # the tolerance of a step
+    assert "5 digits" in inexact(1e-5, 1e-4, "stars", 0.3)[0]  # energy is exact at any tolerance
     assert "about 5 digits, because nu = 0.5 - 2.0e-11" in inexact(5.7e-6, 1e-14, "cholesky", 0.5 - 2e-11)[0]
     assert "badly conditioned" in inexact(1e-12, 1e-7, "mumps", 0.3)[0]
-    assert "time.rtol" in inexact(1e-5, 1e-7, "cg", 0.3)[0]
+    assert "time.rtol" in inexact(1e-12, 1e-2, "cg", 0.3)[0]
 
 
 @pytest.mark.serial

@@ -357,7 +357,7 @@ def test_another_scene_uses_none_of_the_cached_points(
 
 
 def test_an_undamped_scene_is_diagnosed_and_keeps_its_other_questions(result: dict[str, Any], folder: Path) -> None:
-    assert set(result["skipped"]) == {"riccati", "reduced_riccati", "loop"}
+    assert set(result["skipped"]) == {"riccati", "reduced_riccati"}
     assert all(reason.startswith("no damping: ") for reason in result["skipped"].values())
     assert result["points"]["forward"]
     page = (folder / "report.html").read_text()

@@ -1,4 +1,4 @@
-"""Accuracy against time of feedback: Riccati equation, reduced equations, closed loop; each against something else."""
+"""Accuracy against time of feedback: Riccati equation and reduced equations; each against something else."""
 
 from __future__ import annotations
 
@@ -21,12 +21,10 @@ from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.reduced.riccati import gain_error
 from softgrasp.lqr.riccati import solve
-from softgrasp.study.precision import loop as wp_loop
 from softgrasp.study.precision import plots as work_plots
 from softgrasp.study.precision import riccati as wp_riccati
 from softgrasp.study.precision.cache import Cache
-from softgrasp.study.precision.loop import nested_counts
-from softgrasp.study.precision.points import CONTROL, LoopPoint, ReducedRiccatiPoint, Request, RiccatiPoint
+from softgrasp.study.precision.points import CONTROL, ReducedRiccatiPoint, Request, RiccatiPoint
 from softgrasp.study.precision.result import Question, RiccatiReference, WorkStudy
 from softgrasp.study.precision.run import run_study, study_scene
 from softgrasp.study.precision.tables import paper_of, question_table, reference_text
@@ -50,8 +48,6 @@ def _rough() -> Iterator[None]:
     """No test looks at a time, or at more than the existence of a picture."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(work_plots, "save", rough_save)
-        patch.setattr(wp_loop, "SHARES", (8.0, 4.0, 2.0))
-        patch.setattr(wp_loop, "BURST_SECONDS", 0.0)
         patch.setattr(wp_riccati, "REPEAT_SECONDS", 0.0)
         yield
 
@@ -126,25 +122,6 @@ def test_reduced_gains_have_errors_costs_and_times(result: dict[str, Any]) -> No
     assert all(0 < r["seconds"] < r["scratch"] for r in rows)
 
 
-def test_excess_cost_is_what_the_closed_loop_pays(result: dict[str, Any]) -> None:
-    """The cost of the run under a reduced gain against the optimal one, but for what is to come after the end.
-
-    That hides an excess as small as this one; `test_lqr_reduced.py` compares the excess itself.
-    """
-    finest = max(r["steps"] for r in result["points"]["loop"])
-    rows = {
-        (r["basis"], r["N"]): r
-        for r in result["points"]["loop"]
-        if not r["held"] and not r["reduced_plant"] and r["steps"] == finest
-    }
-    optimal = result["references"]["loop"]["optimal"]
-    to_come = result["references"]["loop"]["to_come"]
-    told = next(r for r in result["points"]["reduced_riccati"] if r["series"] == "structured" and r["N"] == 4)
-    extra = (rows[("structured", 4)]["cost"] - rows[("", 0)]["cost"]) / optimal
-    # what is still to come at the end is not paid; it is a quadratic form, and differs twice as much as the gains
-    assert extra == pytest.approx(told["cost_excess"], abs=2 * told["error"] * to_come / optimal)
-
-
 def test_unstable_gains_are_marked_and_never_on_the_front(tmp_path: Path) -> None:
     good = ReducedRiccatiPoint(
         "pod", "POD", 1e-3, 1e-2, method="pod", N=8, error_P=1e-2, error_K=1e-2, cost_excess=0.1,
@@ -156,64 +133,6 @@ def test_unstable_gains_are_marked_and_never_on_the_front(tmp_path: Path) -> Non
     assert [r["pareto"] for r in Question((bad, good)).rows] == [False, True]
     # a basis that has no look of its own is drawn too
     assert work_plots.figure_reduced_riccati([replace(good, series="other"), bad], False, tmp_path / "gains.png")
-
-
-# --- closed loop
-
-
-def test_reference_of_the_loop_is_the_limit_of_small_steps(result: dict[str, Any]) -> None:
-    rows = [r for r in result["points"]["loop"] if r["series"] == "optimal gain, midpoint"]
-    assert [r["steps"] for r in rows] == [512, 256, 128]
-    assert result["references"]["loop"]["complete"]
-    errors = [r["error"] for r in rows]
-    # order 2 of the midpoint rule towards the matrix exponential, which knows no step
-    assert np.log2(errors[1] / errors[0]) == pytest.approx(2, abs=0.05)  # next term: 0.005
-    assert errors[0] < 4e-3  # 2.3e-3 measured: the reference is that limit, also without the part of the hand
-    moved = [r["error_displacement"] for r in rows]
-    assert moved[0] < 1e-4  # 3e-5 measured: the way to go hides the tissue
-    held = [r["error_displacement"] for r in rows_of_series(result, "optimal gain, held")]
-    # the law is half a step late on average
-    assert np.log2(held[1] / held[0]) == pytest.approx(1, abs=0.1)  # next term: 0.03
-    powers = {s["series"]: s["power"] for s in result["slopes"] if s["question"] == "loop"}
-    assert powers["optimal gain, midpoint"] == pytest.approx(-np.log2(errors[1] / errors[0]), abs=1e-9)  # the same fit
-
-
-def rows_of_series(result: dict[str, Any], series: str) -> list[dict[str, Any]]:
-    return [r for r in result["points"]["loop"] if r["series"] == series]
-
-
-def test_cost_of_the_midpoint_loop_is_the_optimal_cost(result: dict[str, Any]) -> None:
-    rows = rows_of_series(result, "optimal gain, midpoint")
-    reference = result["references"]["loop"]
-    for r in rows[:3]:
-        # exact for every step but for what is still to come at the end, which a little depends on it
-        assert r["cost"] == pytest.approx(reference["optimal"] - reference["to_come"], rel=1e-4)
-    held = rows_of_series(result, "optimal gain, held")
-    assert held[2]["cost_error"] > 10 * rows[2]["cost_error"]
-
-
-def test_reduced_plants_are_in_the_diagram(result: dict[str, Any]) -> None:
-    small = [r for r in result["points"]["loop"] if r["reduced_plant"] and not r["held"]]
-    assert {r["N"] for r in small} == {6, 8}
-    assert min(r["error_displacement"] for r in small) < 2e-3  # 8 shapes: 5e-4
-    best = {N: min(r["error"] for r in small if r["N"] == N) for N in (6, 8)}
-    assert best[8] < 0.5 * best[6] < 0.1  # of the deformation: 0.039 and 0.12
-
-
-def test_a_lost_loop_is_said(comm: MPI.Intracomm) -> None:
-    missing = dict.fromkeys(("error_displacement", "error_time", "cost_error", "per_step"), np.inf)
-    lost = LoopPoint("held", "held", np.inf, np.inf, False, steps=4, dt=0.1, basis="", N=0, held=True,
-                     reduced_plant=False, reason="diverged", **missing)  # fmt: skip
-    rows = question_table("loop", [lost]).rows
-    assert rows[0][-1] == "lost"
-    assert rows[0][2:8] == ("-",) * 6
-
-
-def test_numbers_of_steps_nest() -> None:
-    shares = (16.0, 8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
-    assert nested_counts(shares, 600, 438, 5e6) == [9600, 4800, 2400, 1200, 600, 300, 150]
-    assert nested_counts(shares, 75, 1, 1e9) == [1200, 600, 300, 150, 75]
-    assert nested_counts(shares, 600, 100_000, 5e6) == [600, 300, 150]
 
 
 # --- resuming, refusing, files
@@ -229,7 +148,7 @@ def test_interrupted_study_of_feedback_gives_the_same_table(
     def stop_later(label: str, share: float) -> None:
         assert 0 <= share <= 1
         seen.append(label)
-        if label.startswith("closed loop, a priori"):
+        if label.startswith("reduced Riccati equation"):
             signal.raise_signal(signal.SIGINT)  # Ctrl-C
 
     with pytest.raises(Interrupted, match="goes on from there"):
@@ -275,9 +194,9 @@ def test_scenes_without_an_answer_are_told_why(
 def test_a_scene_without_control_has_the_other_questions_only(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     study = study_scene(
         make_scene({k: v for k, v in SMALL.items() if k != "control"}, {"control": None}), comm, mpi_tmp_path,
-        Request(names=("riccati", "loop")),
+        Request(names=("riccati", "reduced_riccati")),
     )  # fmt: skip
-    assert study.skipped == dict.fromkeys(("riccati", "loop"), "the scene has no [control] section")
+    assert study.skipped == dict.fromkeys(("riccati", "reduced_riccati"), "the scene has no [control] section")
 
 
 def test_large_scenes_are_asked_by_name_only(
@@ -293,8 +212,8 @@ def test_large_scenes_are_asked_by_name_only(
 
 def test_questions_are_checked() -> None:
     assert Request().questions == ("forward", "reduced", "bases", *CONTROL)
-    assert Request(names=("loop, riccati",)).questions == ("riccati", "loop")
-    with pytest.raises(SceneError, match=r"^--question what: it must be one of forward, .*loop$"):
+    assert Request(names=("reduced_riccati, riccati",)).questions == ("riccati", "reduced_riccati")
+    with pytest.raises(SceneError, match=r"^--question what: it must be one of forward, .*reduced_riccati$"):
         Request(names=("what",))
     with pytest.raises(SceneError, match=r"^--tolerance and --budget need the questions forward and reduced"):
         Request(tolerance=1e-3, names=("riccati",))
@@ -309,8 +228,8 @@ def test_files_hold_the_questions_of_control(result: dict[str, Any], folder: Pat
     assert {r["question"] for r in rows} == set(CONTROL)
     assert len(rows) == sum(len(v) for v in result["points"].values())
     page = (folder / "report.html").read_text()
-    assert page.count("data:image/png") == 3
-    assert "--question riccati,reduced_riccati,loop" in page
+    assert page.count("data:image/png") == 2
+    assert "--question riccati,reduced_riccati" in page
     assert page.count("<h2>Equation") == 1  # that of the controlled hand: no question follows the scene's own motion
     assert "controlled by" in page
     assert "the motion is prescribed" not in page
@@ -319,7 +238,7 @@ def test_files_hold_the_questions_of_control(result: dict[str, Any], folder: Pat
 
 @pytest.mark.serial
 def test_page_in_a_browser(result: dict[str, Any], folder: Path) -> None:
-    assert look(folder / "report.html", figures=3) == []
+    assert look(folder / "report.html", figures=2) == []
 
 
 def test_the_paper_is_named_for_its_own_scene_only() -> None:
@@ -343,10 +262,3 @@ def test_numbers_do_not_depend_on_the_rank_count(comm: MPI.Intracomm, mpi_tmp_pa
             assert a.ok
             assert b.ok
             assert a.error == pytest.approx(b.error, rel=1e-6)  # modes by another solver
-
-
-def test_a_loop_that_sees_its_hand_only_has_no_error_of_the_tissue(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
-    control = SMALL["control"] | {"outputs": [{"kind": "hand", "name": "hand"}]}
-    study = asked(comm, mpi_tmp_path, {"control": control}, "loop")
-    assert set(study.skipped) == {"loop"}
-    assert "no output moves against the hand" in study.skipped["loop"]

@@ -198,3 +198,25 @@ def test_a_job_that_is_told_to_end_goes_on_later(tmp_path: Path, ranks: int) -> 
     assert again.returncode == 1
     assert f"was written on {ranks} rank" in again.stderr
     assert "n_e" not in again.stdout  # refused before anything was built
+
+
+def test_an_empty_folder_name_is_refused(tmp_path: Path) -> None:
+    run = subprocess.run(
+        [*launched(1), "-m", "softgrasp.study.cli", "simulate", "paper_forward", "--out", ""],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert run.returncode == 1
+    assert run.stderr == "error: --out is empty; name a folder, which is made if it is missing, or . for this one\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_without_a_compiler_there_is_one_sentence(tmp_path: Path, ranks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # no form is compiled yet
+    monkeypatch.setenv("CC", "/nowhere/cc")
+    run = softgrasp("simulate", "paper_forward", "--out", str(tmp_path / "out"), ranks=ranks)
+    assert run.returncode != 0
+    assert "Traceback" not in run.stderr
+    assert run.stderr.count("error: a form cannot be compiled") == 1
+    assert "install a C compiler or name one in CC" in run.stderr
+    assert not (tmp_path / "out").exists()
