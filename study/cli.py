@@ -21,11 +21,29 @@ from softgrasp.study.shell.options import parse_tolerance, takes
 
 LIST_WIDTH = 200  # [letters]
 FOREIGN = 5  # files that a list of runs leaves out by name
+RUN, MODEL, LOOK = "Run a scene", "Reduce, control and study", "Scenes, results and installation"  # groups of --help
+EPILOG = """[bold]Examples[/bold]
+
+softgrasp new my.toml, then softgrasp simulate my.toml
+
+mpiexec -n 4 softgrasp simulate my.toml --set time.steps=400
+
+softgrasp sweep my.toml tissue.material.mu=100:500:9
+
+softgrasp reduce paper_forward --tolerance 1e-2
+
+[bold]Exit status[/bold]
+
+0: done, also where --until stopped a run. 1: refused or failed, with one sentence.
+
+2: a wrong option, or a fault of the program. 3: an answer of query is above its tolerance."""
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
     help="Simulate a rigid robot hand that holds soft tissue. Start with: softgrasp simulate SCENE",
+    epilog=EPILOG,
+    rich_markup_mode="rich",
 )
 
 
@@ -46,7 +64,7 @@ def options(
     """Options of the program itself."""
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def doctor() -> None:
     """Check Python, DOLFINx, MPI, threads, compiler and caches; one line each."""
     from softgrasp.study.shell.doctor import show
@@ -54,7 +72,7 @@ def doctor() -> None:
     raise typer.Exit(0 if show(console()) else 1)
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def scenes() -> None:
     """List the scenes that ship, with what they show."""
     from rich.table import Table
@@ -73,7 +91,7 @@ def scenes() -> None:
     console().print(f"in {here}/, each as NAME.toml", soft_wrap=True)
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def materials() -> None:
     """List the materials that a scene can name, with the sources of their numbers."""
     from softgrasp.study.runs.start import materials_table
@@ -81,7 +99,7 @@ def materials() -> None:
     console().print(materials_table().terminal(wrap=[4], width=console().width))
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def new(
     file: Annotated[Path, typer.Argument(help="scene file to write, e.g. my.toml")],
     solid: Annotated[bool, typer.Option("--3d", help="a block in 3D instead of a strip in 2D")] = False,
@@ -96,7 +114,7 @@ def new(
         console().print(f"next: softgrasp explain {file}; softgrasp simulate {file}", soft_wrap=True)
 
 
-@app.command("list")
+@app.command("list", rich_help_panel=LOOK)
 def list_runs(folder: Annotated[Path, typer.Argument(help="folder that the runs lie below")] = Path("out")) -> None:
     """List the runs below a folder, the newest last."""
     from softgrasp.study.runs.listing import runs_below
@@ -112,7 +130,7 @@ def list_runs(folder: Annotated[Path, typer.Argument(help="folder that the runs 
             wide.print(f"and {len(foreign) - FOREIGN} more")
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 @takes("a b out pictures empty pdf")
 def compare(
     a: Annotated[Path, typer.Argument(help="folder of a run")],
@@ -127,7 +145,7 @@ def compare(
         run_compare(a, b, out or default_folder("compare", Path(f"{a.name}-{b.name}")), console(), **shared)
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def schema() -> None:
     """Print the JSON schema of a scene: every key with its unit and meaning."""
     from softgrasp.fem.scene.scene import scene_schema
@@ -136,7 +154,7 @@ def schema() -> None:
         typer.echo(json.dumps(scene_schema(), indent=2))
 
 
-@app.command()
+@app.command(rich_help_panel=RUN)
 @takes("scene out set_ empty", out="also write result.json and report.html into this folder")
 def explain(scene: Path, out: Path | None, set_: list[str] | None, empty: bool) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
@@ -151,7 +169,7 @@ def _run(command: Callable[..., Any], *, scene: Path, out: Path | None, set_: li
     command(scene, out or default_folder(name, scene), set_ or [], console(), **options)
 
 
-@app.command()
+@app.command(rich_help_panel=RUN)
 @takes("scene out set_ quiet resume pictures until certify empty pdf")
 def simulate(
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in the output folder")] = False,
@@ -167,7 +185,7 @@ def simulate(
     _run(run_simulate, resume=resume, until=until, certify=certify, **shared)
 
 
-@app.command()
+@app.command(rich_help_panel=RUN)
 @takes("scene axes out set_ reduced ranks_each quiet pictures empty pdf")
 def sweep(
     axes: Annotated[
@@ -189,7 +207,7 @@ def sweep(
     _run(run_sweep, axes=axes, reduced=reduced, each=ranks_each, **shared)
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def view(
     folder: Annotated[Path, typer.Argument(help="output folder of simulate or control")],
     field: Annotated[str, typer.Option(help="colour: von_mises, displacement, velocity, stress, strain, layer")] = (
@@ -206,7 +224,7 @@ def view(
         list_files(console(), [save])
 
 
-@app.command()
+@app.command(rich_help_panel=MODEL)
 @takes("scene out set_ quiet pictures empty pdf tolerance")
 def reduce(
     tolerance: Annotated[
@@ -221,7 +239,7 @@ def reduce(
     _run(run_reduce, tolerance=None if tolerance is None else parse_tolerance(tolerance), **shared)
 
 
-@app.command()
+@app.command(rich_help_panel=MODEL)
 @takes(
     "model set_ motion dt tolerance allow fallback scene batch csv out empty pdf",
     out="also write a page, a picture and tables into this folder",
@@ -276,7 +294,7 @@ def query(
     raise typer.Exit(status)
 
 
-@app.command()
+@app.command(rich_help_panel=MODEL)
 @takes("scene out set_ quiet pictures gain_only retune empty pdf")
 def control(
     gain_only: Annotated[
@@ -298,7 +316,7 @@ def control(
     _run(run_control, gain_only=gain_only, retune=retune, **shared)
 
 
-@app.command()
+@app.command(rich_help_panel=MODEL)
 @takes("scene out set_ tolerance budget question quiet empty pdf")
 def study(
     tolerance: Annotated[
@@ -325,7 +343,7 @@ def study(
     _run(run_study, tolerance=accuracy, budget=limit, questions=question, **shared)
 
 
-@app.command()
+@app.command(rich_help_panel=MODEL)
 @takes("scene out set_ quiet empty pdf")
 def effects(**shared: Any) -> None:
     """Switch every effect on and off: what it costs, what it changes, and whether the scene needs it."""

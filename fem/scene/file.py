@@ -35,6 +35,7 @@ _EXPECTED = {
     "string_pattern_mismatch": "in one line without $ and \\",
 }
 
+PART = 4  # letters of a part of a name that is recognised
 _FORMS = {
     "effects.gravity": "gravity = { g = [0, -9.81] }",
     "effects.damping": 'damping = { kind = "kelvin-voigt", beta = 0.01 }',
@@ -265,9 +266,18 @@ def _suggest(path: Sequence[str]) -> str:
     if len(path) == 1 and (below := next((p for p in _below() if p[-1] == path[0]), None)):
         return f"did you mean {'.'.join(below)}?"
     near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
+    near = near or [name for name in known if _akin(path[-1], name)]
     if near:
         return f"did you mean {'.'.join([*path[:-1], near[0]])}?"
+    if elsewhere := next((p for p in _below() if _akin(path[-1], p[-1])), None):
+        return f"did you mean {'.'.join(elsewhere)}?"
     return f"keys of {'.'.join(path[:-1]) or 'a scene'} are {', '.join(known)}"
+
+
+def _akin(word: str, name: str) -> bool:
+    """Whether one is a part of the other: youngs_modulus and young, strain and finite_strain."""
+    part, whole = sorted((word.lower(), name.lower()), key=len)
+    return len(part) >= PART and part in whole
 
 
 def _purpose(path: Sequence[str]) -> str:

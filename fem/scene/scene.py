@@ -41,6 +41,11 @@ class Gravity(Section):
     g: list[float] = Field(description="acceleration of gravity, one entry per axis [m/s2]")
     hand_weight: bool = Field(False, description="whether the hand weighs too [no unit]")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _bare(cls, value: Any) -> Any:
+        return {"g": value} if isinstance(value, list) else value  # gravity = [0, -9.81]
+
 
 class Damping(Section):
     """C = beta K (Kelvin-Voigt) or C = alpha M + beta K (Rayleigh)."""

@@ -47,6 +47,9 @@ def write_tetrahedra(path: Path, top: float = 1.0, tag: int = 1, cells: int = 2)
 REFUSED: list[tuple[Path, list[str], str]] = [
     # unknown, missing, ill-typed
     (PAPER, ["tissue.cels=[1, 2]"], "tissue.cels is not a key; did you mean tissue.cells?"),
+    (PAPER, ["effects.strain=true"], "effects.strain is not a key; did you mean effects.finite_strain?"),
+    (PAPER, ["tissue.material.youngs_modulus=1"], "is not a key; did you mean tissue.material.young?"),
+    (PAPER, ["time.gravity_vector=1"], "time.gravity_vector is not a key; did you mean effects.gravity?"),
     (PAPER, ["mu=1"], "mu is not a key; did you mean tissue.material.mu?"),
     (PAPER, ["tissu.order=1"], "tissu is not a key; did you mean tissue?"),
     (PAPER, ["time.zzz=1"], "time.zzz is not a key; keys of time are steps, end, start, solver, rtol"),
@@ -375,3 +378,10 @@ def test_a_wrong_key_says_how_to_write_it(override: str, form: str) -> None:
     line = str(error.value).partition("write ")[2].partition(";")[0]
     key, _, value = line.partition(" = ")
     load_scene("paper_forward", [f"{section}.{key}={value}"])
+
+
+def test_gravity_may_be_a_bare_list() -> None:
+    short, long = (load_scene(PAPER, [f"effects.gravity={text}"]) for text in ("[0, -9.81]", "{ g = [0, -9.81] }"))
+    assert short == long
+    with pytest.raises(SceneError, match="gravity"):
+        load_scene(PAPER, ["effects.gravity=[0, -9.81, 3]"])

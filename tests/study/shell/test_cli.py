@@ -220,3 +220,11 @@ def test_without_a_compiler_there_is_one_sentence(tmp_path: Path, ranks: int, mo
     assert run.stderr.count("error: a form cannot be compiled") == 1
     assert "install a C compiler or name one in CC" in run.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_help_teaches() -> None:
+    shown = softgrasp("--help")
+    assert shown.returncode == 0
+    for words in ("Run a scene", "Reduce, control and study", "Examples", "Exit status", "3: an answer of query"):
+        assert words in shown.stdout
+    assert shown.stdout.index("Examples") < shown.stdout.index("softgrasp sweep my.toml") < shown.stdout.index("Exit")
