@@ -18,6 +18,7 @@ import numpy as np
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.certified import bounds
 from softgrasp.reduction.certified.certificate import Bound, Certificate, CertifiedRun, MeshNumber, ToleranceError
+from softgrasp.reduction.certified.dual import OutputDuals, corrected
 from softgrasp.reduction.certified.motion import (
     Drive,
     Materials,
@@ -65,6 +66,7 @@ class CertifiedModel:
         mesh: error of the mesh at some parameters.
         drive: the motion of the scene.
         training: what the greedy did, for archive and reports.
+        duals: of the outputs, for sharper bounds on them; None: the bound of the energy norm alone.
     """
 
     fine: ReducedModel
@@ -78,6 +80,7 @@ class CertifiedModel:
     mesh: MeshNumber | None = None
     drive: Drive | None = None
     training: dict[str, Any] = field(default_factory=dict)
+    duals: OutputDuals | None = None
 
     def __post_init__(self) -> None:
         fine, k2, second = self.fine, self.norms.k, self.fine.structure == "second_order"
@@ -97,8 +100,9 @@ class CertifiedModel:
 
     def with_sizes(self, k: int, k2: int) -> CertifiedModel:
         """The same with fewer modes in both bases: leading blocks, no new work."""
-        fine = self.fine if k2 == self.k2 else leading(self.fine, k2)
-        return replace(self, fine=fine, k=k, norms=self.norms.leading(k2))
+        if k2 == self.k2:
+            return replace(self, k=k)
+        return replace(self, fine=leading(self.fine, k2), k=k, norms=self.norms.leading(k2), duals=None)
 
     @cached_property
     def coarse(self) -> ReducedModel:
@@ -222,17 +226,17 @@ class CertifiedModel:
             refined = list(self._motions(self.k, many, drive.finer, g, False))
         result = []
         for materials, answer, fine, finer in zip(many, answers, fines, refined, strict=True):
-            certificate = self._certificate(materials, answer, fine, drive)
+            certificate = self._certificate(materials, answer, fine, drive, g)
             if finer is not None and drive.finer is not None:
                 step = self._time_step(materials, answer, finer, drive, drive.finer)
                 certificate = replace(certificate, time_step=step)
             result.append((materials, answer, certificate))
         return result
 
-    def _certificate(self, materials: Materials, answer: Motion, fine: Motion, drive: Drive) -> Certificate:
+    def _certificate(self, materials: Materials, answer: Motion, fine: Motion, drive: Drive, g: Array) -> Certificate:
         size, rigid = answer.size, answer.q_s @ self.fine.outputs.C_s.T
         deformation = float(bounds.lengths((answer.outputs - rigid).T).max())
-        estimate = wide = None
+        estimate = wide = sharper = None
         if fine is not answer:
             estimate = Bound(self._difference(materials, answer, fine, drive), size, "estimate")
             wide = Bound(np.abs(fine.outputs - answer.outputs), deformation, "estimate")
@@ -240,13 +244,19 @@ class CertifiedModel:
         if self.certify == "estimate" and estimate is not None and wide is not None:
             return Certificate(estimate, wide, inside=inside)
         own = self._bound(fine, materials, drive)
-        reach = self._reach(own, materials, drive)
+        outputs = self._reach(own, materials, drive)
+        if self.duals is not None and fine.modes is not None:
+            compliance, most = self.norms.static_factor(materials) * self.compliance, outputs.max(axis=0)
+            sharper = corrected(self.duals, self.fine, self.norms, fine, materials, drive, g, compliance, most)
+        outputs += 0.0 if wide is None else wide.values
+        if sharper is not None:
+            outputs = np.minimum(outputs, np.abs(fine.outputs + sharper[0] - answer.outputs) + sharper[1])
         effectivity = np.inf
         if estimate is not None and estimate.largest > own.max():
             effectivity = float((estimate.largest + own.max()) / (estimate.largest - own.max()))
         return Certificate(
             energy=Bound(own if estimate is None else estimate.values + own, size, "proof"),
-            outputs=Bound(reach if wide is None else wide.values + reach, deformation, "proof"),
+            outputs=Bound(outputs, deformation, "proof"),
             estimate=estimate,
             outputs_estimate=wide,
             effectivity_at_most=effectivity,

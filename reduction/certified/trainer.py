@@ -20,6 +20,7 @@ from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
 from softgrasp.reduction.certified.certificate import MeshNumber
+from softgrasp.reduction.certified.dual import OutputDuals, output_duals
 from softgrasp.reduction.certified.greedy import REASONS, Greedy, Round, greedy, start
 from softgrasp.reduction.certified.model import Box, CertifiedModel
 from softgrasp.reduction.certified.motion import Materials
@@ -36,6 +37,8 @@ ADDED = 10  # of these become points of the training at most, each as the worst 
 PLACES = 4  # trained parameters at which the mesh is estimated
 ROUNDING = 1e-11  # of a run's length: what is left of it below is rounding
 WATCHED = 20  # parameters by which the size of the smaller basis is found, before all are looked at
+WORTH = 0.7  # of an output's bound, above which duals are not worth the time that they take in every answer
+DUAL_PLACES = 3  # values of each constant at which duals are made to be good
 SEED = 20
 
 
@@ -219,6 +222,12 @@ class Trainer:
         width = len(self.model.system.materials) if self.box.apart else 1
         return self.at(np.random.default_rng(seed).uniform(size=(n, width, 2)))
 
+    def duals(self) -> OutputDuals:
+        """Duals of the outputs for the basis as it is, at which the training ends. Collective."""
+        axis = np.linspace(0.0, 1.0, DUAL_PLACES)
+        draws = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 1, 2)
+        return output_duals(self.model, self.at(draws), self.space, self.Phi)
+
     def destroy(self) -> None:
         """Free the factors. Collective."""
         self.space.destroy()
@@ -301,7 +310,13 @@ def build_certified(
     about = {"proved": max(proved), "checked": len(many), "why": REASONS[state.reason]}
     drive = scene_drive(trainer.model.scene, trainer.model.system.M_hand)
     certify = "estimate" if options.certify == "estimate" and model.certify == "two" else model.certify
-    return replace(model, training={**model.training, **about}, drive=drive, certify=certify)
+    model = replace(model, training={**model.training, **about}, drive=drive, certify=certify)
+    if certify == "estimate":
+        return model
+    with_duals = replace(model, duals=trainer.duals())
+    pair = [m.run(drive=drive, allow=True).certificate.outputs.largest for m in (with_duals, model)]
+    # the same on every rank: small arrays and no part of the mesh
+    return with_duals if (pair[0] < WORTH * pair[1]).any() else model
 
 
 def smallest(
