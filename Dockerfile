@@ -7,5 +7,6 @@ ENV OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 XDG_CACHE_HOME=/opt/cache
 WORKDIR /src
 COPY . .
 RUN pip install --no-cache-dir '.[solver,view]'
+RUN python tools/compile_forms.py && chmod 1777 /opt/cache/*
 WORKDIR /data
 ENTRYPOINT ["softgrasp"]

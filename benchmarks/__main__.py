@@ -1,4 +1,4 @@
-"""``python -m benchmarks forward | riccati | meshes | accuracy | certified``."""
+"""``python -m benchmarks forward | riccati | meshes | accuracy | certified | solvers``."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from typing import Any
 import typer
 from mpi4py import MPI
 
-from benchmarks import accuracy, certified, forward, forward_rows, meshes, riccati
+from benchmarks import accuracy, certified, forward, forward_rows, meshes, riccati, solvers
 from softgrasp.study.shell.ending import run_command
 
 COMMANDS = {
     "forward": forward, "riccati": riccati, "meshes": meshes, "accuracy": accuracy, "certified": certified,
+    "solvers": solvers,
 }  # fmt: skip
 WORKERS: dict[str, Callable[..., Iterable[Any]]] = {
     "forward": forward_rows.measure_row, "riccati": riccati.measure_row,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import stat
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # scenes are read without MPI
     from mpi4py import MPI
 
+SPIN, NAP = 1e-3, 0.02  # [s]: a rank waits awake so long, then it naps, in the end so long at a time
 LONGEST = 590  # letters of a sentence: some lines of a terminal
 
 
@@ -77,6 +79,17 @@ class Paused(Interrupted):
     """A run has come to the step up to which it was asked for."""
 
 
+def meet(comm: MPI.Intracomm) -> None:
+    """Wait for all ranks, asleep when it takes long: one that spins takes a core from those that work. Collective."""
+    if comm.size == 1:
+        return
+    everyone, begin, nap = comm.Ibarrier(), time.monotonic(), 0.0
+    while not everyone.Test():
+        if time.monotonic() - begin > SPIN:
+            nap = min(nap + NAP / 20, NAP)
+            time.sleep(nap)
+
+
 @contextmanager
 def agree(comm: MPI.Intracomm) -> Iterator[None]:
     """Run a block that may fail on some ranks only; then raise on all of them.
@@ -91,6 +104,7 @@ def agree(comm: MPI.Intracomm) -> Iterator[None]:
         yield
     except Exception as error:
         caught = error
+    meet(comm)
     failures = [e for e in comm.allgather(caught) if e is not None]
     if failures:
         raise failures[0] from caught

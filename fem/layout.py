@@ -43,6 +43,7 @@ class BlockLayout:
     start: int  # global number of the first one
     nodes: Array  # coordinates [m] of the owned free nodes, (n_local / d, d)
     reference: Array  # the hand's reference point [m], (d,)
+    order: int = 1  # of the elements
     extent: float = 1.0  # longest side of the bounding box of the free nodes [m], the same on every rank
     held: Array = field(default_factory=lambda: np.zeros((0, 0)))  # owned nodes that follow the hand [m], (k, d)
     patches: Callable[[], Patches] | None = None  # makes the stars when first asked, collective; None for linear cells

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc as PETSc
 
 from softgrasp.fem import _stack as _stack
+from softgrasp.fem.errors import meet
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -181,6 +182,7 @@ def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:
             answer = (call(), None)
         except Exception as error:
             answer = (None, error)
+    meet(comm)
     result, failure = comm.bcast(answer) if comm.size > 1 else answer
     if failure is not None:
         raise failure

@@ -91,6 +91,11 @@ class BlockSystem:
     kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
+    def contrast(self) -> float:
+        """Largest lambda / mu of the materials [1]: 49 at nu = 0.49."""
+        return max(m.lam / m.mu for m in self.materials)
+
+    @property
     def fall(self) -> Array:
         """Free fall in the hand's degrees of freedom, zero without gravity, (n_s,) [m/s^2]."""
         return np.zeros(self.layout.n_s) if self.gravity is None else self.gravity
@@ -109,6 +114,15 @@ class BlockSystem:
     def K_es(self) -> Array:
         """The paper's K_es, local rows (n_local, n_s)."""
         return sum_dense(_stiffness(self.layers, self.materials, "es"))
+
+    def release(self) -> None:
+        """Free the matrices of the affine components, three of the seven of a step, where no more are made. Collective.
+
+        The system steps as before; :meth:`with_materials`, reductions and bounds need what is gone.
+        """
+        for layer in self.layers:
+            for component in (layer.K_mu, layer.K_lambda, layer.M_1):
+                component.ee.destroy()
 
     def with_materials(self, materials: tuple[LayerMaterial, ...]) -> BlockSystem:
         """The same scene with other lambda, mu, rho, beta: a few axpy, no assembly. Collective."""

@@ -142,10 +142,7 @@ def span_of(view: View, V: Array, system: BlockSystem, snapshots: Snapshots) -> 
         X = state_rows(view, system, Z[:n], Z[n:], snapshots.q_s[:, b], snapshots.v_s[:, b])
         norm = squares(X)
         C.append(total(comm, Q.T @ X))
-        X -= Q @ C[-1]
-        again = total(comm, Q.T @ X)  # what rounding left of the first pass
-        C[-1] += again
-        X -= Q @ again
+        X -= Q @ C[-1]  # rounding leaves eps |X|, far below the error of any model
         sums += squares(X), norm
     rest, square = total(comm, sums)
     return Span(comm, Q, np.hstack(C), float(rest), float(square))

@@ -104,6 +104,7 @@ def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
         start=int(comm.exscan(n_local) or 0),
         nodes=nodes,
         reference=reference,
+        order=scene.tissue.order,
         extent=float((high - low).max()) or 1.0,
         held=np.ascontiguousarray(X[contact, :d]),
         patches=cache(partial(make_patches, V, free)) if scene.tissue.order > 1 else None,

@@ -12,7 +12,7 @@ from softgrasp.fem.errors import ResourceError, shortened
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.resources import free_memory
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.solve.solvers import ITERATIVE, choose_solver, factor_on_every_rank
+from softgrasp.fem.solve.solvers import ITERATIVE, SolverName, choose_solver, factor_on_every_rank
 
 # Peak of mesh, forms and matrices, those of a step included [byte a cell], by dimension and order, measured on boxes
 # of 5e4 to 7e5 simplices; then what each layer adds. With the factor they give 0.8 to 1.04 of what was measured. Order
@@ -62,8 +62,8 @@ def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: boo
     kind, d = (dimension, scene.tissue.order), dimension
     n_e = max(int(kind[1] ** d / math.factorial(d) * cells * d), 1)  # p^d / d! nodes a cell in large regular meshes
     n_s = d + (d * (d - 1) // 2 if scene.effects.rotation else 0)
-    layout = BlockLayout(comm, d, n_s, n_e, 0, 0, np.zeros((0, d)), np.zeros(d))
-    name, _ = choose_solver(layout, scene.time.solver)
+    layout = BlockLayout(comm, d, n_s, n_e, 0, 0, np.zeros((0, d)), np.zeros(d), kind[1])
+    name, _ = solver_of(scene, layout)
     copies = comm.size if factor_on_every_rank(layout, name, scene.time.reproducible) else 1
     outputs = sum(n_s if o.kind == "hand" else d for o in scene.control.outputs) if scene.control is not None else d
     # times; q, v, a, c, pulls and temporaries of the hand's table; outputs, their sum and their rigid share: measured
@@ -75,6 +75,14 @@ def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: boo
         factor=factor_bytes(name, n_e, d, copies),
         tables=row * scene.time.steps if run else 0.0,
     )
+
+
+def solver_of(scene: Scene, layout: BlockLayout) -> tuple[SolverName, str]:
+    """The solver of the steps of a scene, with the reason in words, see `choose_solver`. Collective."""
+    materials = [scene.tissue.material, *(layer.material for layer in scene.tissue.layers.values())]
+    contrast = max(m.lam / m.mu for m in materials)
+    free = layout.comm.allreduce(free_bytes(scene), MPI.MIN)
+    return choose_solver(layout, scene.time.solver, False, contrast, scene.time.steps, free)
 
 
 def free_bytes(scene: Scene) -> float:

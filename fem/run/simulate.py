@@ -15,6 +15,7 @@ from mpi4py import MPI
 from softgrasp.fem.checksums import AGAIN
 from softgrasp.fem.errors import CheckpointError, Interrupted, Paused, ResourceError, SceneError, SolverError, agree
 from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.memory import solver_of
 from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.owned import locked
 from softgrasp.fem.petsc import Array, total
@@ -64,7 +65,7 @@ class Run(Stepped):
         scene, system = model.scene, model.system
         self.model = model
         self.end = scene.time_end
-        dt, (name, reason) = self.end / scene.time.steps, choose_solver(system.layout, scene.time.solver)
+        dt, (name, reason) = self.end / scene.time.steps, solver_of(scene, system.layout)
         with model.watch.stage("factor"):
             midpoint = make_midpoint(system, dt, name, scene.time.rtol, scene.time.reproducible)
         self.name: str = system.layout.comm.bcast(secrets.token_hex(6))

@@ -17,7 +17,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import PETSc, to_scipy
+from softgrasp.fem.petsc import PETSc, rows_on_all, to_scipy
 
 
 @dataclass(frozen=True)
@@ -214,6 +214,21 @@ class OrderedFactor:
         rows.reshape(-1, d).take(self.order.nodes, 0, self.r_nodes, "clip")  # "raise" would copy
         self.factor.solve(self.r, self.w)
         self.w_nodes.take(self.places, 0, w.array_w.reshape(-1, d), "clip")
+
+    def columns(self, X: NDArray[Any]) -> NDArray[Any]:
+        """S^-1 X of local rows (n_local, k), Fortran order; each rank solves every size-th column. Collective."""
+        comm = self.comm
+        whole, mine = rows_on_all(comm, X), range(comm.rank, X.shape[1], comm.size)
+        solved = np.empty((whole.shape[0], len(mine)), order="F")
+        for i, j in enumerate(mine):
+            self.r.array_w[:] = self.order.enter(whole[:, j])
+            self.factor.solve(self.r, self.w)
+            solved[:, i] = self.order.leave(self.w.array_r)
+        result, ends = np.empty(X.shape, order="F"), np.cumsum(self.counts)
+        parts = comm.alltoall([np.ascontiguousarray(part) for part in np.split(solved, ends[:-1])])
+        for rank, part in enumerate(parts):
+            result[:, rank :: comm.size] = part
+        return result
 
     def destroy(self) -> None:
         """Free the vectors."""

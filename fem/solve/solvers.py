@@ -18,28 +18,29 @@ from softgrasp.fem.solve.cholesky import (
     factor_blocks,
     make_ksp,
 )
+from softgrasp.fem.solve.costs import FEW_SOLVES, Work
+from softgrasp.fem.solve.costs import ITERATIVE as ITERATIVE
+from softgrasp.fem.solve.costs import SolverName as SolverName
 from softgrasp.fem.solve.stars import Stars, factored
 
-SolverName = Literal["cholesky", "mumps", "cg", "stars"]
-ITERATIVE = ("cg", "stars")
 Reproducible = Literal["auto"] | bool
 
-# Largest problem of each solver on two ranks with 24 GiB. PETSc Cholesky in blocks is fastest per solve, but its
-# factorisation is the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back
-# (docs/benchmarks.md), but not the few solves of an equilibrium or of modes, nor without blocks. Above the last
-# limits the factor itself no longer fits.
-CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 20_000}  # 1: systems without a mesh
-FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}
-DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
-# Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. The price of the same bits in
-# every run: between 1e4 and 5e4 unknowns in 3D steps and factorisation of a spread factor become the faster ones
-# (docs/benchmarks.md), and each rank needs the memory of the whole factor.
-REPEATED_LIMIT = {1: 1_000_000, 2: 1_000_000, 3: 150_000}
+# Largest problem whose single entries PETSc's own Cholesky factors faster than MUMPS, where blocks lose digits.
+FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}  # 1: systems without a mesh
+DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}  # above, the factor itself does not fit
+# Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. On two ranks a spread one
+# takes 0.68 and 0.65 of the time for solve and set-up at 2e4 unknowns in 3D; a whole one on each 1.4 and 1.2, and the
+# memory of one for each, the price of the same bits. In 2D blocks on every rank beat any spread factor to 2e5.
+REPEATED_LIMIT = {1: 1_000_000, 2: 1_000_000, 3: 40_000}
 REPEATED_RANKS = 4
 # Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,
 # which grows with the condition though w may be right. One step of refinement measures the error of w itself.
 DIRECT_RESIDUAL = 1e-8
 DIRECT_ERROR = 1e-6
+OUT_OF_MEMORY = 3  # PC_FACTOR_OUTMEMORY
+# Percent beyond the estimate that MUMPS reserves on each rank. PETSc's 20 has failed on a busy machine, where ranks
+# that lag take less of the work than planned; pages that are not touched cost nothing.
+WORKSPACE = 100
 PACKAGES = {"petsc": "PETSc", "mumps": "MUMPS"}  # PETSc's names of those that factor
 
 
@@ -51,17 +52,34 @@ class SolverUsed(NamedTuple):
     package: str  # that factored or preconditioned the matrix, as PETSc says it
 
 
-def choose_solver(layout: BlockLayout, requested: str = "auto", few: bool = False) -> tuple[SolverName, str]:
-    """The solver for a size, with the reason in words; ``few`` solves with one factor."""
-    n, d = layout.n_e, layout.dimension
-    limit = (FEW_LIMIT if few else CHOLESKY_LIMIT)[d]
+def choose_solver(
+    layout: BlockLayout,
+    requested: str = "auto",
+    few: bool = False,
+    contrast: float = 1.0,
+    steps: int = 200,
+    memory: float = np.inf,
+) -> tuple[SolverName, str]:
+    """The solver of the least modelled time (`softgrasp.fem.solve.costs`) that fits, with the reason in words.
+
+    Args:
+        few: some static solves with one factor, not the steps of a run.
+        contrast: largest lambda / mu, which iterations grow with.
+        steps: of the run.
+        memory: that set-up and factor may take, over all ranks [byte].
+    """
     if requested != "auto":
         return requested, "asked for by the scene"  # type: ignore[return-value]
-    if n <= limit:
-        return "cholesky", f"n_e = {n} <= {limit} in {d}D: fastest per solve"
-    if n <= DIRECT_LIMIT[d]:
-        return "mumps", f"n_e = {n} <= {DIRECT_LIMIT[d]} in {d}D: the factor fits and factors fast"
-    return "cg", f"n_e = {n} > {DIRECT_LIMIT[d]} in {d}D: the factor would not fit"
+    n, ranks = layout.n_e, layout.comm.size
+    work = Work(n, layout.dimension, layout.order, ranks, FEW_SOLVES if few else steps, few, contrast)
+    spread = {name: not factor_on_every_rank(layout, name, "auto") for name in work.candidates()}
+    fits = [name for name in spread if work.memory(name, 1 if spread[name] else ranks) <= memory]
+    names = sorted(fits or [work.leanest()], key=lambda name: work.seconds(name, spread[name]))
+    best = names[0]
+    reason = f"about {work.seconds(best, spread[best]):.2g} s for set-up and {work.solves} solves of n_e = {n}"
+    if len(names) > 1:
+        reason += f" by the cost model, {names[1]} {work.seconds(names[1], spread[names[1]]):.2g} s"
+    return best, reason
 
 
 def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: Reproducible) -> bool:
@@ -129,13 +147,20 @@ class TissueSolver:
         """
         r, w = self.S.createVecs()
         result = np.zeros(X.shape, order="F")
+        some = np.flatnonzero(total(self.S.comm.tompi4py(), np.abs(X).sum(axis=0)) != 0)
+        divided = isinstance(self.factor, OrderedFactor)
+        if isinstance(self.factor, OrderedFactor):  # each rank holds the whole factor
+            result[:, some] = self.factor.columns(X[:, some])
         try:
-            for j in np.flatnonzero(total(self.S.comm.tompi4py(), np.abs(X).sum(axis=0)) != 0):
+            for j in some:
                 r.array_w[:] = X[:, j]
-                self.solve(r, w)
+                if divided:
+                    w.array_w[:] = result[:, j]
+                else:
+                    self.solve(r, w)
+                    result[:, j] = w.array_r
                 if where:
                     self.check(r, w, where)
-                result[:, j] = w.array_r
         finally:
             r.destroy()
             w.destroy()
@@ -259,6 +284,9 @@ def make_solver(
         ksp.setType("preonly")
         ksp.getPC().setType("cholesky")
         ksp.getPC().setFactorSolverType("mumps")
+        if S.comm.size > 1:
+            ksp.getPC().setFactorSetUpSolverType()
+            ksp.getPC().getFactorMatrix().setMumpsIcntl(14, WORKSPACE)
     try:
         _factor(ksp, S, name)
     except SolverError:
@@ -323,7 +351,8 @@ def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
         ) from error
     reason = ksp.getPC().getFailedReason()
     if reason:
-        raise SolverError(f"{name}: set-up failed (reason {reason}); the matrix is not definite")
+        why = "out of memory or workspace; take more ranks" if reason == OUT_OF_MEMORY else "the matrix is not definite"
+        raise SolverError(f"{name}: set-up failed (reason {reason}); {why}")
 
 
 def _stars(S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float) -> TissueSolver:

@@ -153,16 +153,27 @@ def modes_of_plant(problem: RiccatiProblem, k: int) -> tuple[Array, Array, Array
     if layout.n_e > DENSE_MODES:
         omega, Phi = lowest_modes(system, k)
         return omega, Phi, times_columns(system.M_ee, Phi)
+    key = (system.K_ee.handle, system.K_ee.stateGet(), system.M_ee.handle, system.M_ee.stateGet())
+    kept = system.kept.get("dense modes")
+    if kept is None or kept[0] != key or len(kept[1]) < k:
+        kept = key, *_modes_on_root(problem, k), system.K_ee, system.M_ee  # no other matrix can take their handles
+        system.kept["dense modes"] = kept
+    Phi = kept[2][:, :k].copy(order="F")
+    return kept[1][:k].copy(), Phi, times_columns(system.M_ee, Phi)
+
+
+def _modes_on_root(problem: RiccatiProblem, k: int) -> tuple[Array, Array]:
+    """Frequencies, and modes with local rows, by LAPACK. Collective."""
+    system, layout = problem.system, problem.layout
     M, K = gather_matrix(layout, system.M_ee), gather_matrix(layout, system.K_ee)
     modes: tuple[Array, Array] | None = None
     with agree(layout.comm):
         if M is not None and K is not None:
             squares, vectors = scipy.linalg.eigh(K, M, subset_by_index=[0, k - 1])
-            _check_held(squares[0], float(np.linalg.norm(K, 2) / np.diag(M).max()))
+            _check_held(squares[0], float(np.linalg.norm(K, 1) / np.diag(M).max()))
             modes = np.sqrt(squares), vectors
     omega, whole = layout.comm.bcast(modes)
-    Phi = np.asfortranarray(whole[layout.start : layout.start + layout.n_local])
-    return omega, Phi, times_columns(system.M_ee, Phi)
+    return omega, np.asfortranarray(whole[layout.start : layout.start + layout.n_local])
 
 
 def lowest_plant(problem: RiccatiProblem, k: int) -> ModalPlant:

@@ -54,7 +54,7 @@ def make_controller(design: Design, order: int | None = None) -> Controller:
     (2, 8)
     """
     sizes = [order] if order is not None else orders(design)[0]
-    (basis,) = reduce_gains(design, sizes, names=(A_PRIORI,))
+    (basis,) = reduce_gains(design, sizes, names=(A_PRIORI,), offered_only=order is None)
     if order is not None and basis.family is not None:
         basis.family.at(order)  # refuses what does not exist
     return certified_controller(design, basis, order).controller

@@ -60,7 +60,12 @@ def orders(design: Design) -> tuple[list[int], str]:
 
 
 def reduce_gains(
-    design: Design, orders: Sequence[int], notify: Notify | None = None, names: Sequence[str] = tuple(BASES)
+    design: Design,
+    orders: Sequence[int],
+    notify: Notify | None = None,
+    names: Sequence[str] = tuple(BASES),
+    *,
+    offered_only: bool = False,
 ) -> tuple[BasisGains, ...]:
     """Gains of the reduced Riccati equations over their orders, the best of each basis checked on the full plant.
 
@@ -71,6 +76,7 @@ def reduce_gains(
         orders: of the reduced equations; those that a basis has not are left out.
         notify: called with the number of equations done and at most.
         names: keys of :data:`softgrasp.lqr.reduced.bases.BASES`.
+        offered_only: leave out what a controller does not need: errors of P, and checks of gains of large order.
     """
     bases = []
     for i, name in enumerate(names):
@@ -81,11 +87,13 @@ def reduce_gains(
             continue
         reports = []
         for j, N in enumerate(family.orders(orders), 1):
-            reports.append(design.gain_check.first_look(family.at(N)))
+            reports.append(design.gain_check.first_look(family.at(N), error_P=not offered_only))
             if notify is not None:
                 notify(i * len(orders) + j, len(names) * len(orders))
         bases.append(BasisGains(name, family, tuple(reports)))
-    best = certified(design, _ranked(design, bases))
+    best = _ranked(design, bases)
+    if not offered_only:
+        best = certified(design, best)
     n_s = design.problem.layout.n_s
     offered = range(2 * n_s + 2, fast_order(n_s) + 1)  # to the controller
     return tuple(certified(design, [b], offered)[0] if b.name == A_PRIORI else b for b in best)
@@ -140,7 +148,7 @@ def with_bounds[Figures: GainQuality](
 
     See :mod:`softgrasp.lqr.loop.gap`. ``cost_excess_proved`` holds for the run and the optimal feedback after it. What
     the loop's own way costs after that is an allowance in ``cost_excess_at_most``; while it is more than a tenth of the
-    excess, the run is made twice as long, :data:`LONGER` times at most.
+    excess of a gain that is offered, the run is made twice as long, :data:`LONGER` times at most.
 
     Args:
         solution: says what is to come after the end of the run; its error does not matter to the bound.
@@ -152,7 +160,8 @@ def with_bounds[Figures: GainQuality](
     for more in range(LONGER + 1):
         longer = replace(course, steps=course.steps << more)
         gaps = duality_gaps(problem, list(laws.values()), longer, solution, notify)
-        if all(gap.settled or not np.isfinite(gap.gap) for gap in gaps):
+        offered = [gap for i, gap in zip(laws, gaps, strict=True) if gains[i].stable and np.isfinite(gap.gap)]
+        if all(gap.settled for gap in offered):
             break
     for i, gap in zip(laws, gaps, strict=True):
         gains[i] = replace(

@@ -108,7 +108,7 @@ class ClosedLoop:
         if not (np.isfinite(dt) and dt > 0):
             raise ControlError(f"dt = {dt} s must be a positive number")
         self.problem, self.dt = problem, dt
-        name, reason = choose_solver(problem.layout, solver)
+        name, reason = choose_solver(problem.layout, solver, contrast=problem.system.contrast)
         begin = time.perf_counter()
         self.midpoint = make_midpoint(problem.system, dt, name, rtol, reproducible)
         self.solver = self.midpoint.solver.used(reason)

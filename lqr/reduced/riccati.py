@@ -279,13 +279,13 @@ class GainCheck:
         except SolverError:
             return replace(report, certified=False, examined=True)
 
-    def first_look(self, basis: RiccatiBasis) -> GainReport:
+    def first_look(self, basis: RiccatiBasis, *, error_P: bool = True) -> GainReport:  # noqa: N803
         """Errors of P and of the gain, and its poles on the modes kept: no solve with the full plant. Collective."""
         try:
             reduced = reduce_riccati(self.problem, basis)
         except ControlError as error:
             return GainReport(basis.name, basis.N, reason=str(error))
-        off = factor_error(self.problem, self.Z_absolute, reduced.basis, reduced.P_N)
+        off = factor_error(self.problem, self.Z_absolute, reduced.basis, reduced.P_N) if error_P else NAN
         error_K, gain = gain_error(self.problem, self.solution.gain, reduced.gain), reduced.gain  # noqa: N806
         known = self._of_poles(gain.block, self.loop)
         return GainReport(

@@ -58,19 +58,10 @@ def _pairs(X: Array, limit: int | None, share: float | None) -> tuple[Array, Arr
     r = len(X) // 2
     q, p = np.linalg.norm(X[:r]), np.linalg.norm(X[r:])
     ratio = float(q / p) ** 0.5 if q > 0 and p > 0 else 1.0
-    # complex unitary maps are orthogonal and symplectic: work in the few dimensions that q + i p spans
-    E, s, V_h = scipy.linalg.svd(X[:r] / ratio + 1j * X[r:] * ratio, full_matrices=False)
-    keep = s > EPS * s[0]
-    E, Z = E[:, keep], s[keep, None] * V_h[keep]
-
-    def back(Y: Array) -> Array:
-        a, b = np.split(Y, 2)
-        x = E @ (a + 1j * b)
-        return np.vstack([x.real * ratio, x.imag / ratio])
-
-    pool = _Pool(np.vstack([Z.real, Z.imag]), lambda Y: np.linalg.norm(back(Y), axis=0))
+    units = np.repeat([ratio, 1 / ratio], r)[:, None]
+    pool = _Pool(X / units, lambda Y: np.linalg.norm(units * Y, axis=0))
     pool.collect(limit, share)
-    S, T = balanced(back(pool.S), back(pool.T))
+    S, T = balanced(units * pool.S, units * pool.T)
     order = np.argsort(-pool.weights, kind="stable")
     # a pair not looked for may outweigh the lightest that were found
     order = order[pool.weights[order] > pool.unseen]
@@ -101,10 +92,14 @@ class _Pool:
 
     def collect(self, limit: int | None, share: float | None) -> None:
         """Find pairs until the rest is rounding, or until no later pair can be among those that are wanted."""
-        while self.size > SMALLEST * self.largest and 2 * self.S.shape[1] < len(self.S):
+        while 2 * self.S.shape[1] < len(self.S):
             left = float(np.linalg.norm(self.norms(self.rest)))
             if limit is not None and self._enough(limit, share, left):
                 self.unseen = left
+                break
+            if len(self.weights):
+                self._compress(self.rest)
+            if not self.size > SMALLEST * self.largest:
                 break
             if not self._stage():
                 self._alone()
@@ -124,7 +119,11 @@ class _Pool:
         """Add the hyperbolic pairs of the rest that are large and well conditioned; whether there were any."""
         B = form(self.rest, self.rest)
         # i B is Hermitian; for an eigenvalue lambda > 0, u = (b + i a) / sqrt(2) gives a'Bb = lambda, a, b orthonormal
-        values, vectors = scipy.linalg.eigh(1j * (B - B.T) / 2)
+        # +-lambda come in pairs, so that the largest is at least |B|_F / sqrt(columns): vectors of fewer are made
+        least = STAGE * float(np.linalg.norm(B)) / max(len(B), 1) ** 0.5
+        values, vectors = scipy.linalg.eigh(1j * (B - B.T) / 2, subset_by_value=(least, np.inf))
+        if not len(values):
+            return False
         pick = values > max(STAGE * values[-1], 100 * EPS * self.size**2)
         values, vectors = values[pick][::-1], np.sqrt(2) * vectors[:, pick][:, ::-1]
         sigma = np.sqrt(values)
@@ -154,7 +153,7 @@ class _Pool:
         rest = self.rest
         for _ in range(2):  # the second pass takes out the rounding of the first
             rest = self._complement(rest)
-        self._compress(rest)
+        self.rest = rest
 
     def _complement(self, Y: Array) -> Array:
         """(I - S S^+) Y."""

@@ -107,7 +107,7 @@ def small_study(feedback: Design, watch: Stopwatch, note: str) -> GainStudy:
     bases: tuple[BasisGains, ...] = ()
     if not feedback.modal:
         with watch.stage("reduced"):
-            bases = reduce_gains(feedback, orders(feedback)[0], names=(A_PRIORI,))
+            bases = reduce_gains(feedback, orders(feedback)[0], names=(A_PRIORI,), offered_only=True)
     return measure.gain_study(feedback, bases, note)
 
 

@@ -35,7 +35,7 @@ def locking(poisson: dict[str, float], order: int) -> list[str]:
     """P1 elements in a material that hardly changes its volume."""
     return [
         f"nu = {_near_half(nu)} of {name} is above {STIFF}: P1 locks, its error grows with lambda / mu = "
-        f"{2 * nu / (1 - 2 * nu):.3g}; use tissue.order = 2."
+        f"{2 * nu / (1 - 2 * nu):.3g}; use tissue.order = 2, on half the cells along each edge for as many unknowns."
         for name, nu in poisson.items()
         if nu > STIFF + 1e-9 and order == 1
     ]

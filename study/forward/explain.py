@@ -13,14 +13,14 @@ from softgrasp.fem.effects import EFFECTS, Gate
 from softgrasp.fem.effects.gate import SMALL_SHARE, Sag
 from softgrasp.fem.mesh.singular import expected_order
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.model.memory import Need, factor_bytes, need
+from softgrasp.fem.model.memory import Need, factor_bytes, need, solver_of
 from softgrasp.fem.model.refined import by_lines, scene_ends
 from softgrasp.fem.model.scales import SMALL_STRAIN, measure
 from softgrasp.fem.run.motion import largest_acceleration
 from softgrasp.fem.run.snapshots import spread
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
-from softgrasp.fem.solve.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
+from softgrasp.fem.solve.solvers import DIRECT_LIMIT, factor_on_every_rank
 from softgrasp.study.forward.accuracy import estimate_error
 from softgrasp.study.forward.cautions import coarse, locking, looked_at, poisson_ratios, turned
 from softgrasp.study.forward.result import ModelSizes, model_sizes, output_places
@@ -127,7 +127,7 @@ def explain_model(model: Model) -> Explanation:
     scene, system = model.scene, model.system
     layout = system.layout
     d, ranks = layout.dimension, layout.comm.size
-    name, reason = choose_solver(layout, scene.time.solver)
+    name, reason = solver_of(scene, layout)
     copies = ranks if factor_on_every_rank(layout, name, scene.time.reproducible) else 1
     if layout.n_e <= DIRECT_LIMIT[d]:  # the modes need a factor
         omega, Phi = lowest_modes(system, min(MODES, layout.n_e))

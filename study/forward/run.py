@@ -16,6 +16,7 @@ from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError,
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.run.checkpoint import check_ranks
 from softgrasp.fem.run.simulate import FRAMES, LIGHT, Run, RunOptions, frame_count, simulate
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estimate_error
 from softgrasp.study.forward.cautions import looked_at, run_warnings
 from softgrasp.study.forward.result import Simulation, simulate_result
@@ -56,10 +57,10 @@ def run_simulate(
     if resume:
         check_ranks(session.comm, out / "checkpoint")
     model = session.model(scene)
+    model.system.release()
     scene, frames, n_e = model.scene, Frames(model, out, session.pictures), model.system.layout.n_e
-    if (count := frame_count(scene, n_e)) < FRAMES and scene.output.frames == "auto" and scene.output.fields != "none":
-        text = f"fields at {count + 1} instants, for n_e is above {LIGHT}; --set output.frames={FRAMES} writes more"
-        console.print(text, soft_wrap=True)
+    if few := _few_fields(scene, n_e):
+        console.print(few, soft_wrap=True)
 
     def join(run: Run) -> None:
         frames.begin(run)
@@ -78,11 +79,7 @@ def run_simulate(
         try:
             run = simulate(model, options)
         except (Interrupted, ResourceError) as stopped:
-            if files := frames.close():
-                list_files(console, files)
-            if not isinstance(stopped, Paused):
-                raise
-            console.print(str(stopped), soft_wrap=True, markup=False)
+            _say_stopped(console, frames, stopped)
             return {}
     fields = frames.close()
     result = simulate_result(model, run, run_warnings(model, run, frames.most[1:]))
@@ -109,6 +106,23 @@ def run_simulate(
     if certify and mesh_error is None:
         raise SolverError(unknown)
     return numbers
+
+
+def _say_stopped(console: Console, frames: Frames, stopped: Interrupted | ResourceError) -> None:
+    """List the fields of a run that has stopped, and why; raise the reason unless it was asked for. Collective."""
+    if files := frames.close():
+        list_files(console, files)
+    if not isinstance(stopped, Paused):
+        raise stopped
+    console.print(str(stopped), soft_wrap=True, markup=False)
+
+
+def _few_fields(scene: Scene, n_e: int) -> str:
+    """That a large body has its fields written at few instants, unless the scene says at how many."""
+    count = frame_count(scene, n_e)
+    if count >= FRAMES or scene.output.frames != "auto" or scene.output.fields == "none":
+        return ""
+    return f"fields at {count + 1} instants, for n_e is above {LIGHT}; --set output.frames={FRAMES} writes more"
 
 
 def _lost(frames: Frames, run: Run) -> str:

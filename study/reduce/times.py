@@ -1,19 +1,25 @@
-"""Seconds of the full model, and what a reduced one gains."""
+"""Processor time of the full model, and what a reduced one gains."""
 
 from __future__ import annotations
 
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
+
+import numpy as np
 
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.reduction.replay import FullRun, full_run
+from softgrasp.study.shell.timing import RepeatableRun, processor_seconds
 
 FULL_REPEATS = 3  # behind the median of the full run
-PATIENCE = 2.0  # seconds of a full run above which one is enough
+PATIENCE = 2.0  # seconds of a full run above which few are enough
+ROUNDS, OFTEN = 9, 10  # in which both sides take turns, and reduced runs in each: one takes about a millisecond
+STEADY = 1.3  # ratio of the quartiles up to which a speed-up is named
 Say = Callable[[str, int, int], None]
 """Called with what is done, its number and how many there are."""
 
@@ -46,7 +52,7 @@ class SpeedUp:
 
 @dataclass(frozen=True)
 class FullTimes:
-    """Seconds of the full model: the steps of a run alone, and the factorisation before them."""
+    """Processor time of the full model [s]: the steps of a run alone, and the set-up with its factorisation before."""
 
     steps: float
     factor: float
@@ -62,14 +68,79 @@ class FullTimes:
         return {"full_steps_median": self.steps, "full_factor_median": self.factor}
 
 
+@dataclass(frozen=True)
+class Spread:
+    """A ratio over several rounds."""
+
+    low: float  # lower quartile
+    median: float  # of all
+    high: float  # upper quartile
+
+    def __str__(self) -> str:
+        return f"{self.median:.3g} ({self.low:.3g} to {self.high:.3g})"
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Processor time of the full model over that of a reduced one, both sides in turn."""
+
+    again: Spread  # steps over a run of the same model again
+    new: Spread  # factorisation and steps over all that a reduced model does at a new parameter
+    rounds: int  # behind the quartiles
+
+    @property
+    def steady(self) -> bool:
+        """Whether the quartiles lie so close that a number may be named."""
+        return all(x.high <= STEADY * x.low for x in (self.again, self.new))
+
+    def sentence(self, own: float, others: str) -> str:
+        """The headline: speed and error in one sentence, or that there is none. ``others``: error at new materials."""
+        error = f"{own:.2%} off at the scene's parameter, {others}"
+        quartiles = f"(median and quartiles of {self.rounds} rounds, processor time of both in turn)"
+        again, new = f"{self.again} times as fast as the full model", f"{self.new} at a new parameter"
+        if self.steady:
+            return f"It runs {again}, {new} {quartiles}; {error}."
+        return f"The times scatter too much to name a speed-up: {again}, {new} {quartiles}; {error}."
+
+
+def in_turn(model: Model, again: Callable[[], object], new: Callable[[], object]) -> Turns:
+    """Full model and reduced one in turn: ``again`` a run, ``new`` a new parameter and its run. Collective."""
+    comm = model.system.layout.comm
+    for call in (again, new):
+        call()  # what is made once
+    samples: list[tuple[float, float]] = []
+    rounds = ROUNDS
+    while len(samples) < rounds:
+        factor, steps = _full_seconds(model)
+        runs = [processor_seconds(comm, partial(_often, call)) / OFTEN for call in (again, new)]
+        samples.append((steps / runs[0], (factor + steps) / runs[1]))
+        rounds = comm.bcast(ROUNDS if factor + steps < PATIENCE else FULL_REPEATS)
+    spreads = [Spread(*np.quantile(x, (0.25, 0.5, 0.75)).tolist()) for x in zip(*samples, strict=True)]
+    return Turns(spreads[0], spreads[1], len(samples))
+
+
+def _often(call: Callable[[], object]) -> None:
+    for _ in range(OFTEN):
+        call()
+
+
+def _full_seconds(model: Model) -> tuple[float, float]:
+    """Processor time of the factorisation and of all steps of one full run. Collective."""
+    comm, runs = model.system.layout.comm, []
+    factor = processor_seconds(comm, lambda: runs.append(RepeatableRun(replace(model, watch=Stopwatch(comm)))))
+    (again,) = runs
+    steps = processor_seconds(comm, lambda: again.run.advance_to(again.ts, again.run.steps))
+    again.destroy()
+    return factor, steps
+
+
 def measured_run(model: Model, say: Say) -> tuple[FullRun, FullTimes]:
-    """The full run, and its seconds in the median of several when it is short. Collective."""
+    """The full run, and its processor time in the median of several when it is short. Collective."""
     comm = model.system.layout.comm
     first = simulate(model, RunOptions(progress=lambda run: say("full run", run.reached, run.steps)))
     repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
-    runs = [first] + [simulate(replace(model, watch=Stopwatch(comm))) for _ in range(repeats - 1)]
-    factor = statistics.median(run.seconds["factor"] for run in runs)
-    return full_run(model, first), FullTimes(statistics.median(map(steps_seconds, runs)), factor)
+    factor, steps = map(statistics.median, zip(*(_full_seconds(model) for _ in range(repeats)), strict=True))
+    return full_run(model, first), FullTimes(steps, factor)
 
 
 def steps_seconds(run: Trajectory) -> float:

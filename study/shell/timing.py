@@ -43,6 +43,19 @@ def median_seconds(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int) -
     return statistics.median(repeated(comm, call, repeats))
 
 
+def processor_seconds(comm: MPI.Intracomm, call: Callable[[], Any]) -> float:
+    """Processor time of a call on the rank that takes most; other programs hardly change it. Collective."""
+    comm.Barrier()
+    begin = time.process_time()
+    call()
+    return float(comm.allreduce(time.process_time() - begin, MPI.MAX))
+
+
+def median_processor_seconds(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int) -> float:
+    """Median of :func:`processor_seconds`. Collective."""
+    return statistics.median(processor_seconds(comm, call) for _ in range(repeats))
+
+
 def warm(count: int) -> int:
     """Steps before the timed ones: the method before left the caches full of its own factor."""
     return max(1, count // 20)

@@ -35,11 +35,11 @@ from softgrasp.study.reduce.linear.result import (
     nearest,
     timed_points,
 )
-from softgrasp.study.reduce.times import FullTimes, Say
-from softgrasp.study.shell.timing import median_seconds
+from softgrasp.study.reduce.times import FullTimes, Say, Turns, in_turn
+from softgrasp.study.shell.timing import median_processor_seconds
 
 FURTHER = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
-REPEATS, SETUPS = 15, 7  # behind each median of the online time and of the set-up
+REPEATS, SETUPS = 9, 5  # behind each median of the online time and of the set-up
 METHODS_TESTED = 4  # over the box
 PAPER_FULL, PAPER_REDUCED = 16.22, 0.097  # seconds of [SBRH21]: 2n = 1916, 600 steps, and PSD at N = 14
 LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
@@ -117,8 +117,8 @@ def measure(model: ReducedModel, full: FullRun, comparison: ModelComparison) -> 
         small = model.at()
         step, drive = replay_inputs(model, small, full)
         errors = comparison.errors(model, small, run(step, allow_unstable=True, **drive))
-        setup = median_seconds(layout.comm, lambda: replay_inputs(model, model.at(), full)[0].stable, SETUPS)
-        online = median_seconds(layout.comm, lambda: run(step, allow_unstable=True, **drive), REPEATS)
+        setup = median_processor_seconds(layout.comm, lambda: replay_inputs(model, model.at(), full)[0].stable, SETUPS)
+        online = median_processor_seconds(layout.comm, lambda: run(step, allow_unstable=True, **drive), REPEATS)
     return Point(
         N=model.N,
         N_tissue=model.N - (2 * layout.n_s if model.fixed_solid else 0),
@@ -209,6 +209,22 @@ def measure_box(full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress
         largest = max(errors, key=lambda e: (not np.isfinite(e), e))
         summary.append(BoxErrors(m.method.key, m.model.N, runs, own[i], statistics.median(errors), largest))
     return BoxTests(tuple(models), tuple(points), tuple(summary), trained_at if training else (), box_of(scene))
+
+
+def headline_turns(full: FullRun, sweeps: Sequence[MethodSweep]) -> Turns | None:
+    """Full model and the most accurate stable reduced one in turn; None without any. Collective."""
+    if not (chosen := by_error(sweeps)):
+        return None
+    s, p = chosen[0]
+    model = s.models[p.N]
+    step, drive = replay_inputs(model, model.at(), full)
+
+    def new() -> None:
+        small = model.at()
+        again, inputs = replay_inputs(model, small, full)
+        run(again, allow_unstable=not small.stable, **inputs)
+
+    return in_turn(full.model, lambda: run(step, **drive), new)
 
 
 def speed_notes(n_e: int, steps: int, full: FullTimes, sweeps: Sequence[MethodSweep]) -> tuple[str, ...]:

@@ -111,12 +111,14 @@ def summary(study: ReductionStudy) -> list[str]:
     if not (chosen := by_error(study.sweeps)):
         return ["No method has a stable model."]
     s, point = chosen[0]
-    speed = study.times.against(point)
     held = [s for s in study.sweeps if s.points and all(p.stable for p in s.points)]
+    tested = [e for e in study.box.summary if (e.method, e.N) == (s.method.key, point.N) and e.runs <= 1]
+    others = f"not tested at new materials ({study.box.none})"
+    if tested:
+        others = f"{tested[0].median:.2%} in the median and {tested[0].largest:.2%} at most at new materials"
     return [
-        f"At N = {point.N} the most accurate stable model is {s.method.title}: its deformation is "
-        f"{point.error_deformation:.2%} off the full run.",
-        f"It runs {speed.again:.3g} times as fast as the full model, and {speed.new:.3g} times at a new parameter.",
+        f"At N = {point.N} the most accurate stable model is {s.method.title}.",
+        *([] if study.turns is None else [study.turns.sentence(point.error_deformation, others)]),
         f"{len(held)} of {len(study.sweeps)} methods are stable at every N that was tried.",
     ]
 

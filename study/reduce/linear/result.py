@@ -12,7 +12,7 @@ from softgrasp.reduction.bases.registry import Method
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.replay import FullRun
 from softgrasp.study.reduce.result import reduce_result
-from softgrasp.study.reduce.times import FullTimes
+from softgrasp.study.reduce.times import FullTimes, Turns
 
 COMPARED = 14  # N at which methods are compared: the paper's
 LARGER = 30  # N of the second model that is tested at other parameters
@@ -123,6 +123,7 @@ class ReductionStudy:
     sweeps: tuple[MethodSweep, ...]  # every method
     times: FullTimes  # of the full model
     box: BoxTests  # errors at other parameters
+    turns: Turns | None  # full model and the most accurate stable reduced one in turn; None without any
     findings: tuple[str, ...]  # what the numbers show, in sentences
     speed_notes: tuple[str, ...]  # what the times are measured against
 
@@ -161,6 +162,7 @@ class ReductionStudy:
                 "findings": self.findings,
                 "speed": [self.speed(method, p) for method, p in timed_points(self.sweeps)],
                 "speed_notes": self.speed_notes,
+                "headline": self.turns,
                 "box": self.box.to_json(),
             },
             {key: full[key] for key in stages} | self.times.to_json() | seconds,

@@ -34,8 +34,10 @@ def run_linear(session: Session, scene: Scene, names: Sequence[str]) -> dict[str
         drawn = begin_to_draw(session, full, times, sweeps)
         with watch.stage("box"):
             box = measure.measure_box(full, sweeps, partial(say, "other parameters"))
+        with watch.stage("turns"):
+            turns = measure.headline_turns(full, sweeps)
     notes = measure.speed_notes(model.system.layout.n_e, scene.time.steps, times, sweeps)
-    study = ReductionStudy(full, sweeps, times, box, findings(sweeps), notes)
+    study = ReductionStudy(full, sweeps, times, box, turns, findings(sweeps), notes)
     chosen = [(s, p) for s in study.sweeps if (p := best(s.points)) is not None]
     models = [session.out / "models" / f"{s.method.key}.h5" for s, _ in chosen]
     with watch.stage("models"):
@@ -83,6 +85,8 @@ def show(console: Console, study: ReductionStudy) -> None:
     _print(console, report.time_table(study, narrow=True))
     for note in study.speed_notes:
         console.print(note)
+    for sentence in report.summary(study):
+        console.print(sentence, markup=False)
     if box.none:
         console.print(f"no errors at other parameters: {box.none}")
     else:

@@ -17,9 +17,16 @@ from softgrasp.reduction.parameters import grid_of, mirrored, moved_to, outside,
 from softgrasp.reduction.replay import FullRun, full_run
 from softgrasp.reduction.strain.model import StrainModel
 from softgrasp.reduction.strain.training import Reference, Training, pooled_errors, reference_of, replay_strain, train
-from softgrasp.study.reduce.strain.result import CELLS_AT, HeldOutTest, StrainFamily, StrainPoint, StrainStudy
-from softgrasp.study.reduce.times import FullTimes, Say
-from softgrasp.study.shell.timing import median_seconds
+from softgrasp.study.reduce.strain.result import (
+    CELLS_AT,
+    HeldOutTest,
+    StrainFamily,
+    StrainPoint,
+    StrainStudy,
+    most_accurate,
+)
+from softgrasp.study.reduce.times import FullTimes, Say, Turns, in_turn
+from softgrasp.study.shell.timing import median_processor_seconds
 
 SIZES = (8, 10, 14, 18, 24, 30)  # N unless the scene names some: each more displacement costs cells too
 TAUS = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4)
@@ -56,7 +63,22 @@ def measure_strain(own: FullRun, times: FullTimes, say: Say) -> StrainStudy:
     families = [_family("own", model, [own], near, sizes, say)]
     if len(box_runs) > 1:
         families.append(_family("box", model, box_runs, held, sizes, say))
-    return StrainStudy(own, tuple(families), times, missed_by_linear(own), none)
+    p, f = most_accurate(families)
+    turns = strain_turns(own, f.models[p.N])
+    return StrainStudy(own, tuple(families), times, turns, missed_by_linear(own), none)
+
+
+def strain_turns(own: FullRun, rom: StrainModel) -> Turns:
+    """Full model and a reduced one in turn, whose answer at a new parameter comes with its estimate. Collective."""
+    small, materials = rom.at(own.dt, outside=True), own.model.system.materials
+    at_rest = own.model.scene.time.start != "equilibrium"
+    start = None if at_rest else small.equilibrium()
+
+    def new() -> float:
+        other = rom.at(own.dt, materials, outside=True)
+        return other.run(own.hand, a0=None if at_rest else other.equilibrium()).error_estimate
+
+    return in_turn(own.model, lambda: small.run(own.hand, a0=start), new)
 
 
 def missed_by_linear(own: FullRun) -> float:
@@ -165,9 +187,11 @@ def _measure(
     full, comm = training.runs[0], training.model.system.layout.comm
     small = rom.at(full.dt, outside=True)  # few cells may overshoot
     start = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
-    online = median_seconds(comm, lambda: small.run(full.hand, a0=start), RUNS)
-    setup = median_seconds(comm, lambda: rom.at(full.dt).problem.potential.packed, SETUPS)
-    estimate = median_seconds(comm, lambda: replace(done[0]).error_estimate, SETUPS)  # a copy has not made its own
+    online = median_processor_seconds(comm, lambda: small.run(full.hand, a0=start), RUNS)
+    setup = median_processor_seconds(comm, lambda: rom.at(full.dt).problem.potential.packed, SETUPS)
+    estimate = median_processor_seconds(
+        comm, lambda: replace(done[0]).error_estimate, SETUPS
+    )  # a copy has not made its own
     return StrainPoint(
         N=rom.N, k=rom.k, tau=rom.tau, residual=rom.residual, cells=rom.cells.count,
         error_own=own.z, error_own_velocity=own.v, error_own_energy_norm=own.energy_norm,

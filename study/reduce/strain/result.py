@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from softgrasp.reduction.replay import FullRun
 from softgrasp.reduction.strain.model import StrainModel, TrainedBox
-from softgrasp.study.reduce.times import FullTimes
+from softgrasp.study.reduce.times import FullTimes, Turns
 
 CELLS_AT = (14, 24)  # N at which tau is varied
 
@@ -79,5 +80,11 @@ class StrainStudy:
     full: FullRun  # the scene's own full run
     families: tuple[StrainFamily, ...]  # one or two
     times: FullTimes  # of the full run
+    turns: Turns  # full model and the most accurate reduced one in turn
     linear: float  # error in z of linear elasticity on the same scene
     none: str  # why there are no runs at other materials; empty when there are
+
+
+def most_accurate(families: Sequence[StrainFamily]) -> tuple[StrainPoint, StrainFamily]:
+    """The point of the least error on the scene's own run."""
+    return min(((p, f) for f in families for p in f.points), key=lambda pair: pair[0].error_own)

@@ -48,6 +48,7 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
             "error_linear": study.linear,
             "reason_for_none": study.none,
             "findings": lines,
+            "headline": study.turns,
         },
         study.times.to_json() | watch.seconds,
     )
@@ -62,7 +63,7 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
 
     for table in (error_table(study), time_table(study), cell_table(study)):
         session.console.print(table.terminal(wrap=(0,), width=session.console.width))
-    for sentence in lines:
+    for sentence in (*lines, *summary(study)):
         session.console.print(sentence, markup=False)
     list_files(session.console, session.write(scene, result, page))
     return result

@@ -18,7 +18,7 @@ from softgrasp.fem.petsc import whole_copy
 from softgrasp.fem.run.midpoint import TissueMidpoint, midpoint_matrix, state_on
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.solve.cholesky import BACKWARD_ERROR, backward_error, dissect, factor_blocks, make_ksp
-from softgrasp.fem.solve.solvers import FEW_LIMIT, choose_solver, make_solver
+from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from tests.helpers.models import CUBE, close, gather_matrix, gather_rows, local_rows, make_scene
 
 UNEQUAL: dict[str, Any] = {"tissue": {"material": {"lambda": 90.0, "mu": 20.0, "rho": 1.0}}}
@@ -246,7 +246,7 @@ def test_restart_file_holds_the_right_hand_side_in_the_order_of_the_layout(
 
 def test_few_solves_in_space_go_to_mumps_earlier(comm: MPI.Intracomm) -> None:
     layout = build(make_scene(CUBE), comm=comm).system.layout
-    large = replace(layout, n_e=FEW_LIMIT[3] + 3)
+    large = replace(layout, n_e=6_003)
     assert choose_solver(large)[0] == "cholesky"
     assert choose_solver(large, few=True)[0] == "mumps"
     assert choose_solver(large, "cholesky", few=True)[0] == "cholesky"

@@ -7,10 +7,10 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
-from softgrasp.fem.petsc import whole_copy
+from softgrasp.fem.petsc import PETSc, whole_copy
 from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.solve.cholesky import make_ksp
+from softgrasp.fem.solve.cholesky import OrderedFactor, make_ksp
 from softgrasp.fem.solve.solvers import SolverName, make_solver
 from tests.helpers.models import CUBE, close, gather_matrix, gather_rows, local_rows, make_scene
 
@@ -40,6 +40,41 @@ def test_mumps_is_mumps_on_any_ranks(comm: MPI.Intracomm, reproducible: bool) ->
     assert close(gather_rows(layout, w.array_r), np.linalg.solve(dense, full)) < 1e-12  # condition about 1e2
     alone.destroy()
     solver.destroy()
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("name", ["cholesky", "mumps"])
+def test_columns_are_divided_between_ranks(comm: MPI.Intracomm, name: SolverName) -> None:
+    """The bits of one solve after the other, with a share of the solves on each rank."""
+    system = build(make_scene(CUBE), comm=comm).system
+    solver = make_solver(system.K_ee.copy(), name, system.layout, "test_", reproducible=True)
+    X = np.random.default_rng(2).standard_normal((system.layout.n_e, 7))
+    X[:, 3] = 0.0  # costs nothing
+    X = local_rows(system.layout, X)
+    found = solver.columns(X, "a test")
+    r, w = system.K_ee.createVecs()
+    for j in range(X.shape[1]):
+        r.array_w[:] = X[:, j]
+        solver.solve(r, w)
+        assert np.array_equal(found[:, j], w.array_r)
+    if isinstance(solver.factor, OrderedFactor):
+        counts = []
+        factor, solver.factor.factor = solver.factor.factor, Counting(solver.factor.factor, counts)
+        solver.columns(X)
+        solver.factor.factor = factor
+        assert len(counts) == len(range(comm.rank, 6, comm.size))
+    solver.destroy()
+
+
+class Counting:
+    """A factor that notes its solves."""
+
+    def __init__(self, factor: PETSc.Mat, solves: list[int]) -> None:
+        self.factor, self.solves = factor, solves
+
+    def solve(self, r: PETSc.Vec, w: PETSc.Vec) -> None:
+        self.solves.append(1)
+        self.factor.solve(r, w)
 
 
 @pytest.mark.ranks

@@ -54,6 +54,15 @@ def test_a_run_that_kept_other_states_is_not_resumed(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.snapshots.Z, simulate(model, RunOptions(few=7)).snapshots.Z)
 
 
+@pytest.mark.ranks(2)
+def test_a_system_steps_on_without_its_components(comm: MPI.Intracomm) -> None:
+    model = build(make_scene(), comm=comm)
+    before = simulate(model)
+    model.system.release()
+    np.testing.assert_array_equal(simulate(model).final, before.final)
+    assert run_warnings(model, before) != []
+
+
 def test_frames_by_size() -> None:
     scene = make_scene(time={"steps": 600})
     counts = [frame_count(scene, n) for n in (1_000, 100_000, 410_878, 600_000, 10**8)]

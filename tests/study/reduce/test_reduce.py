@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,12 @@ from softgrasp.reduction.bases.states import BasisError, States
 from softgrasp.reduction.parameters import grid_of, outside, training_of, training_states
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, full_run, replay_linear
-from softgrasp.study.reduce.linear.measure import FURTHER, box_models, measure_box, sweep
+from softgrasp.study.reduce.linear.measure import FURTHER, box_models, headline_turns, measure_box, sweep
 from softgrasp.study.reduce.linear.plots import instants
 from softgrasp.study.reduce.linear.views import gather_views
 from softgrasp.study.reduce.run import run_reduce
-from softgrasp.study.reduce.times import FullTimes
+from softgrasp.study.reduce.times import FullTimes, Spread, Turns
+from softgrasp.study.shell.timing import processor_seconds
 from tests.helpers.browser import find_chromium, look
 from tests.helpers.models import gather_matrix, gather_rows, gather_states, make_scene
 
@@ -329,7 +331,7 @@ def test_without_pictures(mpi_tmp_path: Path) -> None:
     reduced(mpi_tmp_path, "reduction.methods=['craig_bampton']", "reduction.N=[6]", pictures=False)
     MPI.COMM_WORLD.Barrier()
     assert {p.name for p in mpi_tmp_path.iterdir()} == {
-        "result.json", "points.csv", "scene.toml", "report.html", "models",
+        "result.json", "points.csv", "scene.toml", "report.html", "models", "softgrasp.files",
     }  # fmt: skip
 
 
@@ -441,6 +443,30 @@ def test_default_box_follows_the_material() -> None:
     assert grid_of(model)[-1] == pytest.approx((6e5, 1.5e5))
     own = build(make_scene(soft, {"reduction": {"mu_range": [20.0, 500.0]}}), comm=MPI.COMM_SELF)
     assert "mu = 1.5e+04 Pa" in outside(own)
+
+
+def test_a_headline_needs_quartiles_that_agree_and_names_the_error_at_new_materials() -> None:
+    close, apart = Spread(24.0, 25.0, 26.0), Spread(20.0, 40.0, 60.0)
+    said = Turns(close, close, 9).sentence(7e-3, "33.00% in the median and 84.00% at most at new materials")
+    assert said.startswith("It runs 25 (24 to 26) times as fast")
+    assert "0.70% off" in said
+    assert "84.00% at most at new materials" in said
+    for turns in (Turns(apart, close, 9), Turns(close, apart, 9)):
+        assert "too much to name a speed-up" in turns.sentence(7e-3, "")
+
+
+def test_both_sides_are_timed_by_processor_time_in_turn(small: FullRun) -> None:
+    comm = small.model.system.layout.comm
+    assert processor_seconds(comm, lambda: time.sleep(0.1)) < 0.05  # as another program's work would pass
+    swept = sweep("craig_bampton", small, wanted(small, [14]))
+    turns = headline_turns(small, [swept])
+    assert turns is not None
+    assert turns.rounds == 9
+    for spread in (turns.again, turns.new):
+        assert 0 < spread.low <= spread.median <= spread.high
+    assert turns.new.median < turns.again.median  # a new parameter costs a set-up that no run has
+    headline = headline_turns(small, [])
+    assert headline is None
 
 
 def test_speed_counts_runs_to_break_even(small: FullRun) -> None:

@@ -1,0 +1,110 @@
+"""What a solver costs on one core by the number of unknowns, and how that shrinks with the ranks: a model.
+
+`python -m benchmarks solvers` measures set-up and solves of every row and prints measured over modelled times.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+SolverName = Literal["cholesky", "mumps", "cg", "stars"]
+ITERATIVE = ("cg", "stars")
+
+Power = tuple[float, float]  # value at 1e5 unknowns and exponent
+GUESSED = 0.3  # of the iterations from zero at 1e-8: those of a step at 1e-4 that begins with the last solutions
+FEW_SOLVES = 20  # of an equilibrium, a mesh estimate or modes with one factor
+PARALLEL = 0.62  # time of work spread over ranks falls like ranks^-0.62: 0.65 of it on two, measured
+
+
+@dataclass(frozen=True)
+class Cost:
+    """One solver on elements of one kind."""
+
+    setup: Power  # [s]
+    pass_: Power  # a solve by a factor, or one iteration [s]
+    memory: Power  # [byte an unknown]
+    most: float  # unknowns up to which it was measured to be worth a choice; a factor does not fit beyond
+    fixed: float = 0.0  # set-up at any size [s]
+    iterations: tuple[float, float] = (1.0, 0.0)  # from zero to 1e-8, a + b sqrt(lambda / mu); 1 by a factor
+
+
+# By solver, dimension and whether the order is 2 or more. Times of direct solvers follow their entries: n log n and
+# n^1.5 in 2D, n^(4/3) and n^2 in 3D, but for the caches; memory of factors is nnz(L) of factor_bytes.
+COSTS: dict[tuple[SolverName, int, bool], Cost] = {
+    ("cholesky", 2, False): Cost((0.67, 1.5), (0.0127, 1.1), (800, 0.1), 2e5),
+    ("cholesky", 2, True): Cost((0.9, 1.5), (0.017, 1.1), (1000, 0.1), 2e5),
+    ("mumps", 2, False): Cost((0.40, 1.25), (0.030, 0.97), (1000, 0.1), 4e6, fixed=0.033),
+    ("mumps", 2, True): Cost((0.55, 1.25), (0.035, 0.97), (1250, 0.1), 4e6, fixed=0.033),
+    ("cg", 2, False): Cost((0.25, 1.0), (0.006, 1.12), (600, 0.0), np.inf, iterations=(9, 9.6)),
+    ("cg", 2, True): Cost((0.6, 1.0), (0.02, 1.0), (1000, 0.0), np.inf, iterations=(16, 16)),
+    ("stars", 2, True): Cost((1.2, 1.0), (0.02, 1.0), (900, 0.0), np.inf, iterations=(7.4, 3.75)),
+    ("cholesky", 3, False): Cost((37.0, 2.0), (0.11, 1.5), (13_000, 1 / 3), 2e4),
+    ("cholesky", 3, True): Cost((37.0, 2.0), (0.11, 1.5), (13_000, 1 / 3), 2e4),
+    ("mumps", 3, False): Cost((13.1, 2.0), (0.158, 1.5), (10_600, 1 / 3), 3e5, fixed=0.033),
+    ("mumps", 3, True): Cost((12.8, 2.0), (0.144, 4 / 3), (10_600, 1 / 3), 3e5, fixed=0.033),
+    ("cg", 3, False): Cost((0.8, 1.0), (0.022, 1.0), (900, 0.0), np.inf, iterations=(9, 9.6)),
+    ("cg", 3, True): Cost((2.0, 1.0), (0.080, 1.0), (1500, 0.0), np.inf, iterations=(16, 16)),
+    ("stars", 3, True): Cost((2.8, 1.17), (0.044, 1.2), (1400, 0.0), np.inf, iterations=(7.4, 3.75)),
+}
+
+
+@dataclass(frozen=True)
+class Work:
+    """What is to be solved with one matrix."""
+
+    n: int  # unknowns
+    dimension: int
+    order: int
+    ranks: int
+    solves: int
+    few: bool  # static ones, to 1e-12, half again the iterations of 1e-8; else steps
+    contrast: float  # largest lambda / mu of the materials
+
+    def memory(self, name: SolverName, copies: int = 1) -> float:
+        """Modelled memory of set-up and factor over all ranks [byte]."""
+        return copies * self.n * self._at(self._cost(name).memory)
+
+    def setup(self, name: SolverName, spread: bool = True) -> float:
+        """Modelled time of the set-up [s]."""
+        cost = self._cost(name)
+        return cost.fixed + self._at(cost.setup) * self._share(spread)
+
+    def solve(self, name: SolverName, spread: bool = True) -> float:
+        """Modelled time of one solve [s]."""
+        seconds = self.solve_from_zero(name) * self._share(spread)
+        return seconds * (1.5 if self.few else GUESSED) if name in ITERATIVE else seconds
+
+    def solve_from_zero(self, name: SolverName) -> float:
+        """Modelled time of one solve on one rank, iterations from zero to 1e-8 [s]."""
+        cost = self._cost(name)
+        a, b = cost.iterations
+        return float((a + b * np.sqrt(max(self.contrast, 0.0))) * self._at(cost.pass_))
+
+    def seconds(self, name: SolverName, spread: bool = True) -> float:
+        """Modelled time of set-up and solves [s]."""
+        return self.setup(name, spread) + self.solves * self.solve(name, spread)
+
+    def candidates(self) -> list[SolverName]:
+        """Solvers of these elements that are measured at this size; few solves go to a factor while it fits."""
+        kind = (2 if self.dimension < 3 else 3), self.order > 1  # systems without a mesh cost like those in 2D
+        names = [name for (name, *of), cost in COSTS.items() if tuple(of) == kind and self.n <= cost.most]
+        direct = [name for name in names if name not in ITERATIVE]
+        return direct if self.few and direct else names
+
+    def leanest(self) -> SolverName:
+        """The candidate that takes the least memory."""
+        return min(self.candidates(), key=self.memory)
+
+    def _cost(self, name: SolverName) -> Cost:
+        high = self.order > 1 or name == "stars"
+        return COSTS[name, 2 if self.dimension < 3 else 3, high]
+
+    def _at(self, power: Power) -> float:
+        value, exponent = power
+        return float(value * (self.n / 1e5) ** exponent)
+
+    def _share(self, spread: bool) -> float:
+        return float(self.ranks**-PARALLEL) if spread else 1.0

@@ -1,0 +1,58 @@
+"""The choice of a solver: least modelled time of those that fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import build
+from softgrasp.fem.solve.costs import COSTS, Work
+from softgrasp.fem.solve.solvers import choose_solver
+from tests.helpers.models import make_scene
+
+SILICONE = 49.0  # lambda / mu at nu = 0.49
+
+
+@pytest.mark.parametrize(
+    ("n", "d", "order", "few", "contrast", "name"),
+    [
+        (1_000, 2, 1, False, 1.0, "cholesky"),
+        (100_000, 2, 1, True, 1.0, "cholesky"),
+        (1_000_000, 2, 1, False, 1.0, "mumps"),
+        (10_000_000, 2, 1, False, 1.0, "cg"),
+        (10_000_000, 2, 2, False, 1.0, "stars"),
+        (3_000, 3, 2, False, SILICONE, "cholesky"),
+        (100_000, 3, 2, False, SILICONE, "mumps"),
+        (1_000_000, 3, 2, False, SILICONE, "stars"),
+        (1_000_000, 3, 1, False, SILICONE, "cg"),
+        (100_000, 3, 2, True, 1.5, "mumps"),  # few solves keep their digits while a factor fits
+        (200_000, 3, 2, False, 1.5, "stars"),  # a third of the iterations of nu = 0.49
+    ],
+)
+def test_choice(n: int, d: int, order: int, few: bool, contrast: float, name: str) -> None:
+    layout = build(make_scene(), comm=MPI.COMM_SELF).system.layout
+    layout = replace(layout, n_e=n, dimension=d, order=order)
+    assert choose_solver(layout, few=few, contrast=contrast)[0] == name
+
+
+def test_what_does_not_fit_is_not_chosen() -> None:
+    layout = replace(build(make_scene(), comm=MPI.COMM_SELF).system.layout, n_e=200_000, dimension=3, order=2)
+    assert choose_solver(layout, contrast=SILICONE)[0] == "mumps"
+    assert choose_solver(layout, contrast=SILICONE, memory=1e9)[0] == "stars"  # the factor takes 2.7 GB
+    assert choose_solver(layout, contrast=SILICONE, memory=1.0)[0] == "stars"  # the leanest, where nothing fits
+
+
+def test_more_steps_pay_for_a_dearer_factor() -> None:
+    work = Work(30_000, 3, 2, 1, 1, False, SILICONE)
+    assert work.seconds("stars") < work.seconds("mumps")
+    many = replace(work, solves=1000)
+    assert many.seconds("mumps") < many.seconds("stars")
+
+
+def test_every_kind_of_elements_has_a_solver_at_any_size() -> None:
+    for d, high in {(d, high) for _, d, high in COSTS}:
+        for few in (False, True):
+            for n in (2, 10**8):
+                assert Work(n, d, 1 + high, 1, 10, few, SILICONE).candidates()

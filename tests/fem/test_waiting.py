@@ -1,0 +1,39 @@
+"""Ranks that wait for another one leave it the cores."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.errors import SceneError, agree
+from softgrasp.fem.petsc import on_root
+
+WORK = 1.0  # [s] that rank 0 takes, asleep itself, so that what others spend is theirs
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("how", ["agree", "on_root"])
+def test_ranks_that_wait_sleep(comm: MPI.Intracomm, how: str) -> None:
+    comm.Barrier()
+    begin = time.process_time()
+    if how == "agree":
+        with agree(comm):
+            time.sleep(WORK * (comm.rank == 0))
+    else:
+        on_root(comm, lambda: time.sleep(WORK))
+    spent = time.process_time() - begin
+    assert spent < 0.25 * WORK  # spinning takes all of it; naps of 20 ms are woken fifty times
+
+
+@pytest.mark.ranks
+def test_an_error_reaches_the_ranks_that_sleep(comm: MPI.Intracomm) -> None:
+    def fail() -> None:
+        with agree(comm):
+            if comm.rank == 0:
+                time.sleep(0.1)
+                raise SceneError("of rank 0")
+
+    with pytest.raises(SceneError, match="of rank 0"):
+        fail()
