@@ -12,6 +12,8 @@ from softgrasp.fem.petsc import Array
 from softgrasp.reduction.online import ReducedTrajectory
 
 Kind = Literal["proof", "estimate"]
+NORMS = {"energy": "largest energy norm of the deformation", "output": "largest deformation at the outputs"}
+"""What the error of the reduction is relative to, by ``reduction.norm``."""
 
 
 class ToleranceError(SoftgraspError):
@@ -108,7 +110,7 @@ class Certificate:
     @property
     def what(self) -> str:
         """What :attr:`reduction` is relative to, in words."""
-        return "largest energy norm" if self.norm == "energy" else "largest deformation at the outputs"
+        return NORMS[self.norm]
 
     @property
     def reduction(self) -> float:

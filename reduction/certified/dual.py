@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 DUALS, MODES = 60, 30  # vectors of Psi, and modes that it is made of at every parameter
 LENGTH = 16  # runs that the circle spans, with sigma = 1 / run: what is added from beyond is e^-16 times as large
 FREQUENCIES = 2000  # at most, at which duals are made: where the residual matters most
+LARGEST = 20_000_000  # numbers on the circle, of which some copies of 16 byte are made
 IGNORED = 2e-3  # of what the residual has on the circle may stay without duals, which take off a factor of 100 or so
 
 
@@ -140,12 +141,14 @@ def corrected(
 
     Returns:
         c'e to be added to the outputs and what may be left of it in size, (steps + 1, p) each; None where the
-        frequencies without duals alone leave more than is known.
+        frequencies without duals alone leave more than is known, or where the run is too long for the memory.
     """
     m, w = motion.modes, motion.w
     assert m is not None
     assert w is not None
     dt, steps = drive.dt, drive.steps
+    if LENGTH * steps * len(w) > LARGEST:
+        return None
     y = w[:, 0] / m.omega[:, None] + m.beta * w[:, 1]
     rows = np.vstack([load_rows(model, motion.v_s, dt, gravity), (y[:, 1:] + y[:, :-1]) / 2])
     still = np.concatenate([-gravity, y[:, 0]]) if drive.start == "equilibrium" else np.zeros(len(rows))

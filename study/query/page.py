@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from softgrasp.reduction.certified.certificate import Certificate
+from softgrasp.reduction.certified.certificate import NORMS, Certificate
 from softgrasp.reduction.certified.model import Box
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
 from softgrasp.study.report.files import write_json
@@ -63,7 +63,7 @@ def error_table(c: Certificate) -> Table:
     mesh = c.mesh.largest if c.mesh is not None else None
     rows = [
         ("reduction", c.reduction, c.how, f"the {c.what}"),
-        ("time step", c.time_step, "estimated", "the largest energy norm"),
+        ("time step", c.time_step, "estimated", f"the {NORMS['energy']}"),
         ("mesh", mesh, "estimated" if mesh is not None else "not known", "the deformation at the outputs"),
     ]
     return Table(("error of the", "at most or about", "it is", "relative to"), rows, "Errors")

@@ -37,7 +37,6 @@ def made(comm: MPI.Intracomm, *changes: dict[str, Any], k: int = 10, k2: int = 2
     return model, certified_model(model, lowest_modes(model.system, k2)[1], k=k, places=places)
 
 
-@pytest.mark.ranks
 @pytest.mark.parametrize("name", list(SCENES))
 def test_the_bound_of_outputs_holds_at_every_step(comm: MPI.Intracomm, name: str) -> None:
     model, certified = made(comm, *SCENES[name])
@@ -52,7 +51,6 @@ def test_the_bound_of_outputs_holds_at_every_step(comm: MPI.Intracomm, name: str
         assert (run.certificate.outputs.values <= plain.certificate.outputs.values).all()
 
 
-@pytest.mark.ranks
 @pytest.mark.parametrize("name", ["kelvin-voigt", "rayleigh from equilibrium"])
 def test_damped_outputs_are_bounded_sharply(comm: MPI.Intracomm, name: str) -> None:
     """Each within four times the truth in the median, where the bound of the energy norm is several times that."""
@@ -69,7 +67,6 @@ def test_damped_outputs_are_bounded_sharply(comm: MPI.Intracomm, name: str) -> N
     assert plain > 2 * sharp
 
 
-@pytest.mark.ranks
 def test_the_computed_part_is_most_of_the_error(comm: MPI.Intracomm) -> None:
     """Of the larger basis itself, whose outputs it corrects; the rest stays within its own bound."""
     model, certified = made(comm, KELVIN_VOIGT, k=20)
