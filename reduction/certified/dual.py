@@ -76,16 +76,17 @@ def dual_vectors(model: Model, places: Sequence[Materials], space: ResidualSpace
         omega, modes = lowest_modes(system, count)
         seen = np.linalg.norm(total(comm, modes.T @ C), axis=1) / omega**2
         parts.append(modes * seen)
-    X = np.hstack(parts)
+    X = np.asfortranarray(np.hstack(parts))
     K_Phi = times_columns(K, Phi)
     gram = total(comm, Phi.T @ K_Phi)
+    whole = float(total(comm, (X * times_columns(K, X)).sum(axis=0)).max())
     for _ in range(2):
         X = X - Phi @ np.linalg.solve(gram, total(comm, K_Phi.T @ X))
     X = np.asfortranarray(X)
     products = total(comm, X.T @ times_columns(K, X))
     squares, V = on_root(comm, lambda: np.linalg.eigh(products))
-    # below 1e-12 of the largest square it is rounding of the projection
-    pick = [j for j in range(len(squares) - 1, -1, -1) if squares[j] > 1e-12 * squares[-1]][:DUALS]
+    # what is shorter than 1e-6 of a vector before the projection may be rounding of Phi, and W singular with it
+    pick = [j for j in range(len(squares) - 1, -1, -1) if squares[j] > 1e-12 * whole][:DUALS]
     return np.asfortranarray(X @ (V[:, pick] / np.sqrt(squares[pick])))
 
 
