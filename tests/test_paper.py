@@ -81,7 +81,7 @@ def test_page_has_every_row(tmp_path: Path, results: dict[str, dict[str, Any]]) 
     verdicts = {row["quantity"]: row["verdict"] for rows in found.values() for row in rows}
     assert verdicts["full run, 600 steps"] == "better"
     assert verdicts["speed-up, PSD, N = 14"] == "better"
-    assert verdicts["speed-up, POD of P, N = 8"] == "differs"  # 500 against 1600
+    assert verdicts["speed-up, POD of P, N = 8"] == ""  # of a P that is not finite
     assert verdicts["best of the six methods, stable, N = 14"] == "reproduced"
     assert verdicts["smallest error of P at N = 8"] == "differs"
     # a time is compared only where the equation's answer has a right digit, and no error is called better for it

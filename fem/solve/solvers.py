@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from softgrasp.fem.errors import SolverError, agree
+from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, petsc_options, total, whole_copy
 from softgrasp.fem.solve.cholesky import (
@@ -45,11 +45,11 @@ PACKAGES = {"petsc": "PETSc", "mumps": "MUMPS"}  # PETSc's names of those that f
 
 
 class SolverUsed(NamedTuple):
-    """What solved the tissue's equations of a run."""
+    """Linear solver of a run."""
 
-    name: SolverName
-    reason: str  # why this one
-    package: str  # that factored or preconditioned the matrix, as PETSc says it
+    name: SolverName  # name in time.solver
+    reason: str  # reason of the choice, in words
+    package: str  # package that factored or preconditioned the matrix, as PETSc reports it
 
 
 def choose_solver(
@@ -102,18 +102,18 @@ def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: 
 class TissueSolver:
     """A factored (or preconditioned) symmetric positive definite matrix of the tissue block."""
 
-    name: SolverName  # who solves
-    ksp: PETSc.KSP  # the PETSc solver; its vectors are those of S with mumps and cg only, so call `solve`
-    S: PETSc.Mat
-    tolerance: float  # relative residual that check accepts
-    # what solves without a detour through ``ksp``: the factor that every rank has whole, perhaps in an order of its own
+    name: SolverName  # name in time.solver
+    ksp: PETSc.KSP  # PETSc's solver; its vectors are those of S with mumps and cg only, so call `solve`
+    S: PETSc.Mat  # symmetric positive definite matrix, (rows, rows) [N/m]
+    tolerance: float  # largest relative residual that ``check`` accepts [1]
+    # factor that solves without ``ksp``: whole on every rank, perhaps in an order of its own
     # (softgrasp.fem.solve.cholesky), or that of one rank; None where the factor is spread or there is none
     factor: PETSc.Mat | OrderedFactor | None = None
-    stars: Stars | None = None  # the preconditioner of stars, which owns S
+    stars: Stars | None = None  # preconditioner of solver "stars", which owns S; else None
 
     @property
     def package(self) -> str:
-        """Who made the factor, asked of PETSc, or what preconditions the iteration."""
+        """Package of the factor, as PETSc reports it, or of the preconditioner."""
         pc = self.ksp.getPC()
         if self.stars is not None:
             return f"stars, {self.stars.package}"
@@ -302,7 +302,7 @@ def _repeated(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float) 
     nodes = np.arange(layout.n_e // layout.dimension)
     ksp = make_ksp(whole_copy(S), prefix, "mumps")
     try:
-        with agree(S.comm.tompi4py()):
+        with raise_on_all_ranks(S.comm.tompi4py()):
             _factor(ksp, S, "mumps")
     except SolverError:
         ksp.destroy()
@@ -328,7 +328,7 @@ def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, 
         order, P = dissection.order, dissection.matrix(every)
         every.destroy()
     try:
-        with agree(S.comm.tompi4py()):
+        with raise_on_all_ranks(S.comm.tompi4py()):
             ksp = factor_blocks(P, prefix, "petsc" if layout.n_e <= FEW_LIMIT[layout.dimension] else "mumps")
     except SolverError:
         S.destroy()

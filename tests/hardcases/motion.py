@@ -23,7 +23,7 @@ from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.statics import equilibrium
-from softgrasp.fem.strain.body import Body
+from softgrasp.fem.strain.body import HyperelasticBody
 from softgrasp.fem.system import BlockSystem, Damping
 from tests.hardcases.cases import EPS, Family, HardCase, here, make, scaled_condition, textbook, thin
 from tests.hardcases.textbook import implicit_and_explicit, in_turn, textbook_midpoint
@@ -233,7 +233,7 @@ def squeezed(model: Model, J: float) -> Array:
 def newton_midpoint(system: BlockSystem, z: Array, dt: float) -> float:
     """The same by the midpoint rule, s^2 M w + f(z + w) = s M v, with Newton's method from w = 0 as it comes."""
     assert system.points is not None
-    body, M, s = Body(system.points, system.materials), to_scipy(system.M_ee), 2 / dt
+    body, M, s = HyperelasticBody(system.points, system.materials), to_scipy(system.M_ee), 2 / dt
     x, f = system.K_ee.createVecs()
 
     def at(u: Array) -> tuple[Array, float]:
@@ -296,7 +296,7 @@ def sag_error(model: Model, newton: bool) -> float:
     system = model.system
     assert system.points is not None
     assert system.gravity is not None
-    body, load = Body(system.points, system.materials), system.G @ system.gravity
+    body, load = HyperelasticBody(system.points, system.materials), system.G @ system.gravity
     z, f = system.K_ee.createVecs()
     if not newton:
         z.array_w[:] = equilibrium(system)

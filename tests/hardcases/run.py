@@ -63,6 +63,7 @@ def run_hardcases(
             show(console, results[-1])
             bar.advance(task)
     result = HardCaseResult(tuple(results), quick)
+    out.mkdir(parents=True, exist_ok=True)  # a case that ran in a folder of its own may have given this one back
     files = write_files(out, result, family, pictures)
     console.print(result.summary, soft_wrap=True)
     list_files(console, files)
