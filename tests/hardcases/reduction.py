@@ -22,7 +22,7 @@ from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.bases.inner import orthonormality
 from softgrasp.reduction.bases.registry import make_bases, make_basis
 from softgrasp.reduction.bases.states import States, states_of
-from softgrasp.reduction.model import SmallModel
+from softgrasp.reduction.model import ReducedSystem
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, full_run
@@ -141,7 +141,7 @@ def edge_rows(quick: bool) -> Iterator[HardCase]:
 # --- models that grow
 
 
-def textbook_loop(rom: SmallModel, dt: float, force: Array) -> Array:
+def textbook_loop(rom: ReducedSystem, dt: float, force: Array) -> Array:
     """Outputs of the midpoint rule on E x' = A x + B u as a textbook has it, unstable or not."""
     op = rom.operators
     lu = scipy.linalg.lu_factor(op.E - dt / 2 * op.A)
@@ -154,7 +154,7 @@ def textbook_loop(rom: SmallModel, dt: float, force: Array) -> Array:
     return np.asarray(X @ rom.outputs.C_z.T + X @ op.S_q.T @ rom.outputs.C_s.T)
 
 
-def _tip_error(case: FullRun, rom: SmallModel, force: Array, checked: bool) -> float:
+def _tip_error(case: FullRun, rom: ReducedSystem, force: Array, checked: bool) -> float:
     """Largest error of the outputs over the largest deformation seen."""
     outputs = run(rom, case.dt, force=force).outputs if checked else textbook_loop(rom, case.dt, force)
     if not np.isfinite(outputs).all():
