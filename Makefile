@@ -7,10 +7,10 @@ BIN := .venv/bin
 STAMP := .venv/.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo paper_forward paper_accurate test check lint bench hardcases paper pictures docs clean
+.PHONY: help env demo paper_forward paper_accurate test test-all check lint bench hardcases paper pictures docs clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
 
 env: $(STAMP) ## make .venv with everything needed (redone when pyproject.toml changes)
 
@@ -34,11 +34,14 @@ check: lint ## what to run before a commit: lint, types of what changed, the tes
 	$(BIN)/python -m pytest -q tests/test_project.py
 
 # More ranks than cores: a rank that waits gives its core away (MPICH; without it this part took twice as long).
-test: export MPIR_CVAR_CH4_PROGRESS_THROTTLE = 1
-test: lint ## lint, then the tests on 1, 2 and 3 ranks
+test test-all: export MPIR_CVAR_CH4_PROGRESS_THROTTLE = 1
+test: lint ## lint, all tests on one rank, those marked `ranks` on 2 and 3
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
-	$(BIN)/mpiexec -n 2 $(BIN)/python -m pytest -q
+	$(BIN)/mpiexec -n 2 $(BIN)/python -m pytest -q -m "ranks and not slow"
 	$(BIN)/mpiexec -n 3 $(BIN)/python -m pytest -q
+
+test-all: test ## the same, and on 2 ranks the tests without the mark too (nightly)
+	$(BIN)/mpiexec -n 2 $(BIN)/python -m pytest -q -m "not ranks and not slow"
 
 bench: $(STAMP) ## print the table of costs of the forward run
 	$(BIN)/python -m benchmarks forward

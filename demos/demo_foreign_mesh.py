@@ -13,7 +13,7 @@ import meshio
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.errors import agree
+from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
@@ -42,7 +42,7 @@ assert run.energy_drift < 1e-11  # work, energy and dissipation balance to round
 # %%
 CORE, REST, HELD = 1, 2, 3
 folder = Path(comm.bcast(mkdtemp() if comm.rank == 0 else None))
-with agree(comm):
+with raise_on_all_ranks(comm):
     if comm.rank == 0:
         mesh = meshio.read(scenes / "meshes" / "pillow_small.msh")
         tetra = mesh.get_cells_type("tetra")

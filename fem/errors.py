@@ -1,4 +1,4 @@
-"""Errors for users, and how all ranks agree on them.
+"""Errors for users, raised on all ranks or on none.
 
 Every message is one sentence that names the file, key or value and says what would be right.
 """
@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # scenes are read without MPI
     from mpi4py import MPI
 
-SPIN, NAP = 1e-3, 0.02  # [s]: a rank waits awake so long, then it naps, in the end so long at a time
-LONGEST = 590  # letters of a sentence: some lines of a terminal
+SPIN = 1e-3  # time that a rank waits awake before it sleeps [s]
+NAP = 0.02  # longest sleep between two looks at the other ranks [s]
+LONGEST = 590  # letters of the longest sentence, some lines of a terminal [1]
 
 
 def one_line(text: str) -> str:
@@ -56,11 +57,11 @@ class SceneError(SoftgraspError):
 
 
 class MeshError(SoftgraspError):
-    """A mesh cannot be read or cannot carry the model."""
+    """A mesh cannot be read, or is not fit for the model."""
 
 
 class SolverError(SoftgraspError):
-    """A linear solve failed or missed its tolerance."""
+    """A solve failed or missed its tolerance."""
 
 
 class ResourceError(SoftgraspError):
@@ -76,11 +77,11 @@ class Interrupted(SoftgraspError):
 
 
 class Paused(Interrupted):
-    """A run has come to the step up to which it was asked for."""
+    """A run has reached the step at which it was asked to pause."""
 
 
 def meet(comm: MPI.Intracomm) -> None:
-    """Wait for all ranks, asleep when it takes long: one that spins takes a core from those that work. Collective."""
+    """Barrier that sleeps when it takes long, since a rank that spins takes a core from those that work. Collective."""
     if comm.size == 1:
         return
     everyone, begin, nap = comm.Ibarrier(), time.monotonic(), 0.0
@@ -91,7 +92,7 @@ def meet(comm: MPI.Intracomm) -> None:
 
 
 @contextmanager
-def agree(comm: MPI.Intracomm) -> Iterator[None]:
+def raise_on_all_ranks(comm: MPI.Intracomm) -> Iterator[None]:
     """Run a block that may fail on some ranks only; then raise on all of them.
 
     The exception of the lowest failing rank is raised on every rank, so no rank waits in a collective call that

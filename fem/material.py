@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LayerMaterial:
-    """Lame constants [Pa], density [kg/m^3] and Kelvin-Voigt time [s] of one layer."""
+    """Isotropic material of one layer."""
 
-    lam: float
-    mu: float
-    rho: float
-    beta: float = 0.0
+    lam: float  # first Lame parameter lambda [Pa]
+    mu: float  # shear modulus [Pa]
+    rho: float  # density [kg/m^3]
+    beta: float = 0.0  # Kelvin-Voigt time, D = beta K [s]

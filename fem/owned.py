@@ -19,33 +19,33 @@ from typing import TYPE_CHECKING, Any
 
 import psutil
 
-from softgrasp.fem.errors import SceneError, agree, no_pipe
+from softgrasp.fem.errors import SceneError, no_pipe, raise_on_all_ranks
 
 if TYPE_CHECKING:  # pages are written without MPI
     from mpi4py import MPI
 
 LOCK, LIST = "softgrasp.lock", "softgrasp.files"
-SAME_START = 1.0  # [s] the start of a process is read from a clock that the system may correct
+SAME_START = 1.0  # tolerance of the start of a process [s]: the system may correct the clock that it is read from
 
 
 @dataclass(frozen=True)
 class Process:
-    """Who holds a folder."""
+    """Process that has locked a folder."""
 
-    host: str  # name of the machine and, in a container, its table of processes
-    pid: int
-    started: float  # [s] since 1970; a number of a process is given again after some time
+    host: str  # name of the machine and, in a container, of its process table
+    pid: int  # process number on that machine
+    started: float  # start of the process since 1970 [s]; process numbers are used again after some time
 
     @classmethod
     def own(cls) -> Process:
-        """This one."""
+        """The process that asks."""
         host = socket.gethostname()
         with suppress(OSError):
             host += f" {os.readlink('/proc/self/ns/pid')}"
         return cls(host, os.getpid(), psutil.Process().create_time())
 
     def ended(self) -> bool:
-        """Whether it is known to run no more: only a process of this machine can be asked for."""
+        """Whether the process has ended for certain, which is known of processes of this machine only."""
         if self.host != Process.own().host:
             return False
         try:
@@ -59,10 +59,10 @@ class Process:
 class _Held:
     """The folder of this process."""
 
-    folder: Path  # resolved
-    pid: int  # a forked process inherits this object, but not the lock
-    locked: bool  # by this rank
-    made: bool  # by the lock, so that an empty one goes with it
+    folder: Path  # absolute path without links
+    pid: int  # number of the process that locked it; a forked one inherits this object, but not the lock
+    locked: bool  # whether this rank has the lock
+    made: bool  # whether locking made the folder, so that an empty one is removed
     noted: set[str]  # names in the list, relative to the folder
 
 
@@ -70,7 +70,7 @@ _held: _Held | None = None
 
 
 def hold(folder: Path) -> None:
-    """Make and lock a folder until :func:`release` or the end of this process, and give back the one before.
+    """Make and lock a folder until :func:`release` or the end of this process, and release the one before.
 
     Not collective: call on rank 0, and :func:`follow` on the others. Raises SceneError: another process holds it.
     """
@@ -102,7 +102,7 @@ def hold(folder: Path) -> None:
 
 
 def follow(folder: Path) -> None:
-    """Note files of this rank in the list of a folder that rank 0 holds."""
+    """Add files of this rank to the list of a folder that rank 0 has locked."""
     global _held
     home = folder.resolve()
     if _held is None or _held.folder != home:
@@ -141,7 +141,7 @@ def _serial(home: Path) -> Iterator[None]:
 
 
 def release() -> None:
-    """Give the folder back; the list of a run that wrote nothing goes, and a folder that was made for it."""
+    """Unlock the folder; remove the list of a run that wrote nothing, and a folder that was made for it."""
     global _held
     held, _held = _held, None
     if held is None or not held.locked or held.pid != os.getpid():
@@ -159,14 +159,14 @@ atexit.register(release)
 
 @contextmanager
 def locked(comm: MPI.Intracomm, folder: Path) -> Iterator[None]:
-    """Hold a folder during a block, unless the command that runs holds it or one above it. Collective.
+    """Lock a folder during a block, unless the running command has locked it or one above it. Collective.
 
     Raises SceneError: another process holds it.
     """
     if _held is not None and folder.resolve().is_relative_to(_held.folder):
         yield
         return
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         if comm.rank == 0:
             hold(folder)
     try:
@@ -176,19 +176,19 @@ def locked(comm: MPI.Intracomm, folder: Path) -> Iterator[None]:
 
 
 def begin_list(command: str, scene: str) -> None:
-    """Say in the list whose folder it is, where it does not yet; the folder is held."""
+    """Write command and scene to the list of the locked folder, unless it names them already."""
     if _held is not None and read_list(_held.folder)[0] is None:
         _append(_held.folder / LIST, {"command": command, "scene": scene})
 
 
 def forget() -> None:
-    """Know that the list was removed."""
+    """Clear the names that this process noted, after the list was removed."""
     if _held is not None:
         _held.noted.clear()
 
 
 def note(*files: Path) -> None:
-    """Take files that are about to be written into the list; nothing for files in other folders."""
+    """Add files that are about to be written to the list; files in other folders are left out."""
     if _held is None:
         return
     for file in files:
@@ -211,7 +211,7 @@ def _append(path: Path, entry: Any) -> None:
 
 
 def read_list(folder: Path) -> tuple[tuple[str, str] | None, set[str]]:
-    """Command and scene that a folder belongs to, None without a list, and the names of its files.
+    """Command and scene of a folder, None without a list, and the names of its files.
 
     A line that was cut off is no entry, nor is a name that leads out of the folder.
     """

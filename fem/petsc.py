@@ -154,10 +154,10 @@ def normalising(gram: Array, share: float, least: float = 0.0) -> Array:
     return np.asarray(vectors[:, keep] / np.sqrt(sizes[keep]))
 
 
-def led(
+def driven_by_root(
     comm: MPI.Intracomm, call: Callable[[Array], Array], method: Callable[[Callable[[Array], Array]], Array]
 ) -> Array:
-    """What ``method(call)`` returns: it decides on rank 0 alone, and every rank takes part in its calls. Collective.
+    """Result of ``method(call)``, a method that runs on rank 0 alone and whose calls run on every rank. Collective.
 
     Raises Exception: of the method, or of ``call``, which must raise it on all ranks alike.
     """
@@ -169,7 +169,7 @@ def led(
             comm.bcast(None)
 
     while comm.rank > 0 and (x := comm.bcast(None)) is not None:
-        with suppress(Exception):  # rank 0 tells it to all
+        with suppress(Exception):  # rank 0 reports it to all
             call(x)
     return on_root(comm, lead)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 from mpi4py import MPI
 
-from softgrasp.fem.errors import ResourceError, agree
+from softgrasp.fem.errors import ResourceError, raise_on_all_ranks
 
 MARGIN = 2**18  # bytes: tables of contents that the libraries add, more when they close a file
 CONTAINER = Path("/sys/fs/cgroup")
@@ -54,7 +54,7 @@ def check_room(comm: MPI.Intracomm, files: Sequence[Path], needed: int, reserve:
     """
     total = comm.allreduce(needed) + MARGIN + reserve
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         free = shutil.disk_usage(files[0].parent).free
         if free < total:
             raise ResourceError(f"{files[0]} needs {total} bytes more and {free} are free on the disk; free the disk")

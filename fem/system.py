@@ -19,7 +19,7 @@ from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc, combine, times_columns, total
 
 if TYPE_CHECKING:  # only scenes with finite strain load it
-    from softgrasp.fem.strain.points import Points
+    from softgrasp.fem.strain.points import QuadraturePoints
 
 
 @dataclass(frozen=True)
@@ -35,23 +35,20 @@ class Component:
 class LayerBlocks:
     """Affine components of one layer: K = mu K_mu + lambda K_lambda, M = rho M_1."""
 
-    name: str
-    K_mu: Component
-    K_lambda: Component
-    M_1: Component
+    name: str  # name of the layer
+    K_mu: Component  # stiffness at mu = 1, lambda = 0 [m^(d-2), in 2D times the thickness]
+    K_lambda: Component  # stiffness at mu = 0, lambda = 1, in the same unit
+    M_1: Component  # mass at rho = 1 [m^d, in 2D times the thickness]
 
 
 @dataclass(frozen=True)
 class Damping:
-    """D = alpha M + beta K on the tissue; ``matrix`` replaces beta K when layers differ.
+    """D = alpha M + beta K on the tissue."""
 
-    ``in_space`` is true when alpha drags the rigid motion too.
-    """
-
-    alpha: float = 0.0
-    beta: float = 0.0
-    in_space: bool = False
-    matrix: PETSc.Mat | None = None
+    alpha: float = 0.0  # mass-proportional rate [1/s]
+    beta: float = 0.0  # stiffness-proportional time [s]
+    in_space: bool = False  # whether alpha drags the rigid motion too
+    matrix: PETSc.Mat | None = None  # D in place of beta K where layers differ in beta [N s/m], (n_e, n_e); else None
 
     @property
     def active(self) -> bool:
@@ -72,22 +69,22 @@ class BlockSystem:
     module. Matrices are distributed over ``layout.comm``, small arrays are the same on every rank.
     """
 
-    layout: BlockLayout  # sizes and ownership
-    layers: tuple[LayerBlocks, ...]  # affine components
-    materials: tuple[LayerMaterial, ...]  # one per layer
+    layout: BlockLayout  # sizes and ownership of the unknowns
+    layers: tuple[LayerBlocks, ...]  # affine components of each layer
+    materials: tuple[LayerMaterial, ...]  # material of each layer
     M_ee: PETSc.Mat  # tissue mass [kg], (n_e, n_e), symmetric positive definite
-    K_ee: PETSc.Mat  # tissue stiffness [N/m], alike
+    K_ee: PETSc.Mat  # tissue stiffness [N/m], (n_e, n_e), symmetric positive definite
     T: Array  # rigid modes of the hand at the free nodes, local rows (n_local, n_s) [1, m]
     G: Array  # M_es + M_ee T, local rows (n_local, n_s) [kg, kg m]
     M_hand: Array  # hand mass matrix, (n_s, n_s) [kg, kg m^2]
     M_rigid: Array  # inertia of the tissue moved rigidly with the hand, (n_s, n_s) [kg, kg m, kg m^2]
-    damping: Damping  # of the tissue
+    damping: Damping  # damping of the tissue
     gravity: Array | None = None  # free fall in the hand's degrees of freedom, (n_s,) [m/s^2], or None
-    hand_weight: bool = False  # gravity acts on the hand's own mass too
-    two_way: bool = False  # the tissue acts on the hand
-    graded: bool = False  # nodes crowd where cells shrink, so that Euclidean norms of node values mean little
-    points: Points | None = None  # where finite strain evaluates its law; None: K_ee z is the whole force
-    # factor and modes of K_ee, made by the first who asks (softgrasp.fem.solve.stiffness, softgrasp.fem.solve.modes)
+    hand_weight: bool = False  # whether gravity acts on the hand's own mass too
+    two_way: bool = False  # whether the tissue acts on the hand
+    graded: bool = False  # whether cell sizes vary so much that Euclidean norms of node values mean little
+    points: QuadraturePoints | None = None  # quadrature points of the finite-strain law; None: linear, force K_ee z
+    # factor and modes of K_ee, made on the first request (softgrasp.fem.solve.stiffness, softgrasp.fem.solve.modes)
     kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property

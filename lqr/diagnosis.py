@@ -23,18 +23,18 @@ Kind = Literal["error", "warning"]
 class Finding:
     """One sentence about the control problem; an error means that no solver should be started."""
 
-    kind: Kind  # error or warning
-    topic: str  # weights, data, outputs, inputs, damping
-    sentence: str  # what is wrong and what would be right
+    kind: Kind  # "error" or "warning"
+    topic: str  # "weights", "data", "outputs", "inputs" or "damping"
+    sentence: str  # the fault and its remedy
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is known before the solve."""
+    """Findings and estimated poles from before the solve."""
 
-    findings: tuple[Finding, ...]  # problems, worst first
+    findings: tuple[Finding, ...]  # errors and warnings, errors first
     rates: ModeRates | None  # estimated closed-loop poles of the lowest modes; None when the data are unusable
-    damping_enough: float  # Kelvin-Voigt time beta [s] from which the low-rank solvers converge quickly; nan if unknown
+    damping_enough: float  # least Kelvin-Voigt time beta for fast low-rank solvers, nan if unknown [s]
 
     @property
     def solvable(self) -> bool:

@@ -40,15 +40,15 @@ LOW_RANK_LIMIT = {1: 800_000, 2: 800_000, 3: 40_000}  # 1: systems without a mes
 class SolverChoice:
     """A method and the reason in words."""
 
-    method: Method
-    reason: str
+    method: Method  # name of the method
+    reason: str  # reason of the choice, in words
 
 
 def choose(problem: RiccatiProblem, method: Spelling = "auto") -> SolverChoice:
     """The method for a problem.
 
     Newton-ADI by default; RADI where damping couples the modes; Galerkin where complex factorisations no longer fit.
-    Layers with different damping couple the modes of the start to those left out, so K_0 is off by that coupling,
+    Layers with different damping couple the modes of the start to those left out, so K_0 has an error of that coupling
     however many modes are kept short of all (residual 1e-4 after one Newton step with 10 to 120 of 286 modes): three
     steps, where RADI takes the solves of one. Nor is that start known to stabilise.
 
@@ -63,7 +63,7 @@ def choose(problem: RiccatiProblem, method: Spelling = "auto") -> SolverChoice:
     if layout.states <= DENSE_STATES:
         return SolverChoice("dense", f"{layout.states} states <= {DENSE_STATES}: all modes, exact to rounding")
     if not damping.active:
-        return SolverChoice("dense", "without damping X has no low rank: only the dense method can tell what is lost")
+        return SolverChoice("dense", "without damping X has no low rank: only the dense method can report what is lost")
     limit = LOW_RANK_LIMIT[layout.dimension]
     if layout.n_e > limit:
         return SolverChoice("galerkin", f"n_e = {layout.n_e} > {limit} in {layout.dimension}D: few factorisations fit")

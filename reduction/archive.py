@@ -16,7 +16,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
-from softgrasp.fem.errors import agree, no_pipe
+from softgrasp.fem.errors import no_pipe, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.owned import note
@@ -184,7 +184,7 @@ def write_model(
     comm = MPI.COMM_SELF if reconstruction is None else reconstruction.layout.comm
     unfinished = path.with_name(path.name + ".part")
     try:
-        with agree(comm):
+        with raise_on_all_ranks(comm):
             if comm.rank == 0:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 note(unfinished, path)
@@ -193,10 +193,10 @@ def write_model(
                     small(file)
         for rank in range(comm.size):
             # one file, one writer at a time: the file library here is not a parallel one
-            with agree(comm):
+            with raise_on_all_ranks(comm):
                 if reconstruction is not None and comm.rank == rank:
                     _write_rows(reconstruction, unfinished)
-        with agree(comm):
+        with raise_on_all_ranks(comm):
             if comm.rank == 0:
                 with h5py.File(unfinished, "r+") as file:
                     write_checksums(file)
@@ -215,7 +215,7 @@ def reading(
     Raises ModelError: the file is missing, damaged, or of another version or scene; or the block finds a key missing.
     """
     comm = MPI.COMM_SELF if layout is None else layout.comm
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         try:
             with h5py.File(no_pipe(path), "r") as file:
                 if file.attrs.get("format") not in (LINEAR, STRAIN):

@@ -7,6 +7,7 @@ from softgrasp.fem import _stack as _stack  # threads and MPI, before numpy and 
 # isort: split
 import gc
 import os
+import re
 import resource
 import sys
 import time
@@ -70,6 +71,14 @@ def pytest_configure(config: pytest.Config) -> None:
     reporter = config.pluginmanager.getplugin("terminalreporter")
     if OWN.rank > 0 and reporter is not None:  # rank 0 speaks for all
         reporter._tw._file = open(os.devnull, "w")  # noqa: SIM115  (lives as long as the process)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not even import files whose tests all skip: on three ranks, and with ``-m ranks``, those without the mark."""
+    if not collection_path.name.startswith("test_") or not (OWN.size > 2 or "ranks" in config.option.markexpr):
+        return None
+    most = [int(n or 3) for n in re.findall(r"\bmark\.ranks\b(?:\((\d)\))?", collection_path.read_text())]
+    return max(most, default=0) < OWN.size or None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import ast
 import doctest
+import inspect
 import re
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 import softgrasp as sg
+from softgrasp.fem.run.trajectory import Trajectory
 
 pytestmark = pytest.mark.serial
 ROOT = Path(__file__).parents[1]
@@ -37,13 +41,28 @@ def test_every_name_has_an_example_that_runs(name: str, tmp_path: Path, monkeypa
     assert result.failed == 0
 
 
+def undocumented(source: str) -> list[str]:
+    """Public fields of a class without a docstring below them."""
+    (cls,) = ast.parse(source).body
+    assert isinstance(cls, ast.ClassDef)
+    pairs = [(a, b) for a, b in pairwise([*cls.body, ast.Pass()]) if isinstance(a, ast.AnnAssign)]
+    fields = [(ast.unparse(a.target), isinstance(getattr(b, "value", None), ast.Constant)) for a, b in pairs]
+    return [name for name, documented in fields if not documented and not name.startswith("_")]
+
+
+@pytest.mark.parametrize("value", [sg.Scene, sg.Model, Trajectory])
+def test_every_field_has_a_docstring(value: type) -> None:
+    assert undocumented(inspect.getsource(value)) == []
+    assert undocumented('class A:\n    a: int  # one\n    b: int\n    """Two."""\n    c: int') == ["a", "c"]
+
+
 @pytest.mark.parametrize("name", sg.__all__)
 def test_every_docstring_says_what_a_user_needs(name: str) -> None:
     """The equation first, units or shapes, errors, and a source that REFERENCES.md has."""
     value = getattr(sg, name)
     text = value.__doc__
     assert ("Raises:" in text) == (name not in ("Model", "Scene"))  # data that others make
-    if isinstance(value, type) and name != "Scene":  # its keys say their units in the schema
+    if isinstance(value, type) and name not in ("Model", "Scene"):  # these have a docstring under each field
         assert re.search(r"^    (Attributes|Args):$", text, re.MULTILINE)
     known = set(re.findall(r"\*\*\[(\w+)\]", (ROOT / "REFERENCES.md").read_text()))
     cited = {key for keys in re.findall(r"\[([A-Z][\w, ]*\d\d\w?)\]", text) for key in keys.split(", ")}

@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.accuracy.estimate import estimate, marked_cells, next_order
 from softgrasp.fem.accuracy.krylov import KrylovModel, krylov_model
-from softgrasp.fem.errors import SceneError, agree
+from softgrasp.fem.errors import SceneError, raise_on_all_ranks
 from softgrasp.fem.mesh.grading import bisect, distribute
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
 from softgrasp.fem.model.build import MeshEstimate, Model
@@ -106,12 +106,12 @@ def _effectivity(old: Array, error: Array, new: Array) -> float:
     return float(np.clip(value, SEEN, MOST_ACCEPTED))
 
 
-def estimated(model: Model) -> MeshEstimate:
+def estimated(model: Model, *, surplus: bool = False, cells: list[int] | None = None) -> MeshEstimate:
     """The estimate of a model that was built without one, against the tolerance of its scene if it has one. Collective.
 
     Raises SolverError, SceneError, MeshError: see :func:`softgrasp.fem.accuracy.estimate.estimate`.
     """
-    result, refine = estimate(model), model.scene.tissue.refine
+    result, refine = estimate(model, surplus=surplus, cells=cells), model.scene.tissue.refine
     if refine is None or refine.tolerance is None:
         return result
     limit, cause = (
@@ -140,7 +140,7 @@ def _finer(small: KrylovModel, finer: KrylovModel, refine: Refine, aim: float, f
         return _more_lines(model, aim)
     marked = marked_cells(small, finer, factor)
     whole: Whole | None = None
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         if model.space.mesh.whole is not None and marked is not None:
             whole = bisect(model.space.mesh.whole, marked)
             if unknowns(whole, scene.tissue.order) > refine.most:

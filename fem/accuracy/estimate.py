@@ -31,6 +31,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from softgrasp.fem.accuracy.krylov import KrylovModel, krylov_model, run_krylov, static_solves
+from softgrasp.fem.accuracy.surplus import MODES, prolong, surplus_model
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
@@ -53,22 +54,39 @@ COMPARED = {2: (1e-2, 1e-3), 3: (3e-2,)}  # tolerances of graded meshes to compa
 MOST_COMPARED = 60_000  # unknowns of such a mesh
 
 
-def estimate(model: Model, coarse: KrylovModel | None = None, finer: KrylovModel | None = None) -> MeshEstimate:
+def estimate(
+    model: Model,
+    coarse: KrylovModel | None = None,
+    finer: KrylovModel | None = None,
+    *,
+    surplus: bool = False,
+    cells: list[int] | None = None,
+) -> MeshEstimate:
     """Estimate the error that the mesh leaves in the outputs of the scene's run. Collective.
 
     Args:
         coarse: its small model, if there is one.
         finer: that of :func:`next_order`, likewise, for scenes with ``tissue.refine``.
+        surplus: correct the next order by some iterations instead of solving there, for scenes with ``tissue.refine``.
+        cells: of a coarser box, whose error is taken for that of the model.
 
     Raises:
         SolverError: a static solve fails.
         SceneError, MeshError: the graded mesh to compare with cannot be made, or is too large.
     """
     begin = time.perf_counter()
+    if cells is not None:
+        tissue = model.scene.tissue.model_copy(update={"cells": cells})
+        result = estimate(like(model, model.scene.model_copy(update={"tissue": tissue})))
+        seconds = model.system.layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX)
+        none = np.zeros_like(result.delta)
+        own = {"shift": zone_shift(model), "n_e": model.system.layout.n_e, "seconds": seconds}
+        return replace(result, by="coarser", delta=none, **own)
     small = coarse or krylov_model(model)
     run = small.run
     if model.scene.tissue.refine is not None:
-        other = finer or krylov_model(next_order(model))
+        up = next_order(model) if finer is None else finer.model
+        other = finer or (surplus_model(small, up) if surplus else krylov_model(up))
         by, bound, offer = "order", BOUNDS[min(model.scene.tissue.order, 3)], None
         relative, delta = difference(small, other)
         bound *= relative
@@ -205,7 +223,6 @@ def zone_shift(model: Model) -> float:
     return float(ends[ends > slack].max(initial=0.0))
 
 
-MODES = 4  # 4 and 10 modes gave the same estimate to one percent on the paper's scene
 INSTANTS = 100
 DIGITS = 7  # of the largest eta_T that count: solves carry more, and cells that mirror each other stay together
 GAIN = 1.2  # eta_T of the marked cells over what bisection takes away: it splits their neighbours too
@@ -252,16 +269,6 @@ def indicators(small: KrylovModel, finer: KrylovModel) -> Array:
     reach = np.linalg.norm(small.C @ Q[:, :m], axis=0) * amplitude * omega[:m] ** 3 * model.scene.time_end / 2
     phases = np.einsum("ckk->ck", E[:, n_s + p :, n_s + p :]) @ np.minimum(reach, np.sqrt(reach.max() * reach))
     return np.asarray(statics + phases)
-
-
-def prolong(model: Model, finer: Model, X: Array) -> Array:
-    """Columns of the mesh's space in that of the next order, local rows. Collective."""
-    v = dolfinx.fem.Function(finer.space.V)
-    Y = np.empty((finer.system.layout.n_local, X.shape[1]), order="F")
-    for j in range(X.shape[1]):
-        v.interpolate(model.space.nodal(X[:, j]))
-        Y[:, j] = v.x.array.reshape(-1, model.space.mesh.dimension)[finer.space.free].ravel()
-    return Y
 
 
 def cell_products(model: Model, X: Array) -> Array:

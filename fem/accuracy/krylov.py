@@ -22,6 +22,7 @@ from softgrasp.fem.model.outputs import make_outputs, output_columns
 from softgrasp.fem.petsc import Array, normalising, times_columns, total
 from softgrasp.fem.run.motion import force_values, free_table
 from softgrasp.fem.solve.stiffness import factored_stiffness
+from softgrasp.fem.system import BlockSystem
 
 BLOCKS = 4
 DROPPED = 1e-12  # of the squared length before the projection: directions that are rounding only, or known already
@@ -34,15 +35,14 @@ class KrylovModel:
     """M xi'' + D xi' + K xi = G c, z = V xi, of a model; small arrays on every rank."""
 
     V: Array  # basis, local rows (n_local, N), with V' K V = 1
-    # M, D: projected mass and damping (N, N)
-    M: Array
-    D: Array
-    G: Array  # coupling (N, n_s)
-    C: Array  # outputs of the tissue against the hand (p, N)
-    C_s: Array  # their rigid part (p, n_s)
+    M: Array  # projected mass V' M_ee V, (N, N)
+    D: Array  # projected damping V' D_ee V, (N, N)
+    G: Array  # projected coupling V' G, (N, n_s)
+    C: Array  # outputs of the deformation, C_z' V, (p, N)
+    C_s: Array  # outputs of the rigid motion, (p, n_s)
     # static solutions K_ee^-1 [G, C'], local rows (n_local, n_s + p); columns of outputs that are none are zero
     X: Array
-    model: Model  # whose it is
+    model: Model  # full model
 
     @cached_property
     def run(self) -> KrylovRun:
@@ -68,25 +68,38 @@ def krylov_model(model: Model) -> KrylovModel:
 
     A mesh with fewer unknowns than columns ends in a basis of its whole space, where the small model is the full one.
     """
-    system, comm = model.system, model.system.layout.comm
-    outputs = make_outputs(model.scene, system)
-    C = output_columns(outputs, system.layout.n_local)
+    system = model.system
+    C = output_columns(make_outputs(model.scene, system), system.layout.n_local)
     V = K_V = np.zeros((len(C), 0))
     with static_solves(model) as solve:
         last = X = solve(np.hstack([system.G, C]))
         for k in range(BLOCKS):
             if k:
                 last = solve(times_columns(system.M_ee, last))
-            for _ in range(2):  # once is not enough where blocks are nearly dependent
-                K_last = times_columns(system.K_ee, last)
-                lengths = total(comm, np.einsum("ij,ij->j", last, K_last))
-                known = total(comm, V.T @ K_last)
-                last, K_last = last - V @ known, K_last - K_V @ known
-                gram = total(comm, last.T @ K_last)
-                scale = np.sqrt(np.maximum(lengths, 1e-300))
-                Q = comm.bcast(normalising((gram + gram.T) / 2 / np.outer(scale, scale), 0.0, DROPPED) / scale[:, None])
-                last, K_last = last @ Q, K_last @ Q
-            V, K_V = np.hstack([V, last]), np.hstack([K_V, K_last])
+            V, K_V, last = extended(system, V, K_V, last)
+    return projected(model, V, X)
+
+
+def extended(system: BlockSystem, V: Array, K_V: Array, block: Array) -> tuple[Array, Array, Array]:
+    """V and K V with the directions that a block adds, V' K V = 1, and these directions. Collective."""
+    comm = system.layout.comm
+    for _ in range(2):  # once is not enough where blocks are nearly dependent
+        K_block = times_columns(system.K_ee, block)
+        lengths = total(comm, np.einsum("ij,ij->j", block, K_block))
+        known = total(comm, V.T @ K_block)
+        block, K_block = block - V @ known, K_block - K_V @ known
+        gram = total(comm, block.T @ K_block)
+        scale = np.sqrt(np.maximum(lengths, 1e-300))
+        Q = comm.bcast(normalising((gram + gram.T) / 2 / np.outer(scale, scale), 0.0, DROPPED) / scale[:, None])
+        block, K_block = block @ Q, K_block @ Q
+    return np.hstack([V, block]), np.hstack([K_V, K_block]), block
+
+
+def projected(model: Model, V: Array, X: Array) -> KrylovModel:
+    """The model on a basis V with V' K V = 1, with its static solutions X, local rows. Collective."""
+    system, comm = model.system, model.system.layout.comm
+    outputs = make_outputs(model.scene, system)
+    C = output_columns(outputs, system.layout.n_local)
     damping = system.damping
     M = total(comm, V.T @ times_columns(system.M_ee, V))
     D = damping.alpha * M + damping.beta * np.eye(len(M))

@@ -24,9 +24,9 @@ class PictureMesh:
     points: Array  # vertices [m], shape (n, d)
     cells: Integers  # vertices of the cells, shape (m, d + 1)
     facets: Integers  # vertices of the boundary facets, shape (k, d), the body to their left or below
-    contact: Integers  # vertices of those that the hand holds, shape (c, d)
+    contact: Integers  # vertices of the facets in the contact zone, shape (c, d)
     layers: Integers  # number of the layer of each cell, shape (m,)
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # name of each layer
     reference: Array  # point the hand turns about [m], shape (d,)
     n_s: int  # hand degrees of freedom
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from softgrasp.fem.errors import agree, no_pipe
+from softgrasp.fem.errors import no_pipe, raise_on_all_ranks
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array, on_root
 
@@ -106,7 +106,7 @@ def write_vtu(
     try:
         file = MPI.File.Open(comm, str(path), MPI.MODE_CREATE | MPI.MODE_WRONLY)
         try:
-            with agree(comm):
+            with raise_on_all_ranks(comm):
                 for place, content in contents:
                     file.Write_at(place, content)
         finally:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from softgrasp.fem.checksums import digest
-from softgrasp.fem.errors import MeshError, agree
+from softgrasp.fem.errors import MeshError, raise_on_all_ranks
 from softgrasp.fem.mesh.cells import (
     DIMENSIONS,
     check_interfaces,
@@ -74,7 +74,7 @@ def read_mesh(
     curved cells, a mesh of surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted.
     """
     arrays: MeshArrays | None = None
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         if comm.rank == 0:
             arrays = load_arrays(path, scale, repair, seam, limit)
     return spread(comm, arrays)

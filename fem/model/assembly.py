@@ -24,30 +24,30 @@ from softgrasp.fem.scene.scene import FiniteStrain, Scene
 from softgrasp.fem.system import Component, LayerBlocks
 
 if TYPE_CHECKING:
-    from softgrasp.fem.strain.points import Points
+    from softgrasp.fem.strain.points import QuadraturePoints
 
 
 @dataclass
 class Inventory:
-    """What an assembly made: names of compiled forms and of allocated tissue operators."""
+    """Names of the forms and tissue operators that an assembly made."""
 
-    forms: list[str] = field(default_factory=list)
-    operators: list[str] = field(default_factory=list)
+    forms: list[str] = field(default_factory=list)  # names of the compiled forms
+    operators: list[str] = field(default_factory=list)  # names of the allocated tissue operators
 
 
 @dataclass(frozen=True)
 class Discretisation:
     """Function space and the split of its nodes into contact and free ones."""
 
-    mesh: TissueMesh
+    mesh: TissueMesh  # distributed mesh with its marks
     V: Any  # displacement space (Lagrange P1 or P2, blocked)
-    contact: np.ndarray  # owned local node indices that follow the hand
-    free: np.ndarray  # owned local node indices of the tissue unknowns
+    contact: np.ndarray  # local numbers of the owned nodes that follow the hand, (k,)
+    free: np.ndarray  # local numbers of the owned nodes of the tissue unknowns, (n_local / d,)
     is_e: PETSc.IS  # PETSc index set of the free dofs (blocked)
     R: Array  # rigid modes on the contact rows, zero elsewhere, (owned dofs, n_s)
-    layout: BlockLayout
+    layout: BlockLayout  # sizes and ownership of the unknowns
     layers: tuple[str, ...]  # names of the layers
-    layer: np.ndarray  # number of the layer of each owned cell
+    layer: np.ndarray  # number of the layer of each owned cell, (owned cells,)
 
     def nodal(self, free: Array, held: Array | float = 0.0) -> Any:
         """The function with these values (n_local,) on the free dofs and ``held`` on the others. Collective."""
@@ -216,9 +216,9 @@ def layer_numbers(mesh: TissueMesh, scene: Scene) -> tuple[tuple[str, ...], np.n
     return names if counts[-1] else names[:-1], numbers
 
 
-def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> Points:
+def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> QuadraturePoints:
     """Points of the owned cells; K(0) = K_ee to rounding. Collective."""
-    from softgrasp.fem.strain.points import Points, make_gradient  # only scenes with finite strain pay for it
+    from softgrasp.fem.strain.points import QuadraturePoints, make_gradient  # only scenes with finite strain pay for it
 
     d, V, order = space.mesh.dimension, space.V, scene.tissue.order
     edges, cells = space.mesh.edges, space.mesh.owned
@@ -232,7 +232,7 @@ def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> Po
     B = make_gradient(layout.comm, space.gradients(at), nodes, (layout.n_local, layout.n_e))
     cell = np.repeat(np.arange(first, first + cells), each)
     places = (space.mesh.vertices[:, :1] + at @ edges).reshape(-1, d)
-    return Points(B, vol, np.repeat(space.layer, each), cell, places, d, effect.law, effect.tol)
+    return QuadraturePoints(B, vol, np.repeat(space.layer, each), cell, places, d, effect.law, effect.tol)
 
 
 def _free_nodes(space: Discretisation) -> np.ndarray:

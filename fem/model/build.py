@@ -36,21 +36,23 @@ class MeshEstimate:
     """Error of the deformation: outputs against the hand, over the largest of them."""
 
     estimate: float  # largest |delta y| over the run, relative [1]
-    bound: float  # what the error has not exceeded wherever it could be checked, relative [1]
-    # estimate of y - y_h at the time steps, (steps + 1, p) [m, rad]; y_h + delta is the corrected output
+    bound: float  # relative error that was not exceeded wherever it could be checked [1]
+    # estimate of y - y_h at the time steps, zero if by "coarser", (steps + 1, p) [m, rad]; y_h + delta is corrected
     delta: Array = field(repr=False)
     # relative errors of the two lowest frequencies that the run can see, omega_h / omega - 1 [1]
     omega: tuple[float, ...]
     time_error: float  # error of the time steps, relative like ``estimate`` [1]
     shift: float  # largest distance of the ends of the zone held from ``contact.box`` [m]
-    n_e: int  # tissue unknowns of the mesh that was estimated
-    finer: int  # tissue unknowns of the mesh it was compared with
-    by: str  # "order" (elements of the next order on the same cells) or "graded" (another mesh, which meets the zone)
-    tolerance: float | None = None  # of the scene, or None
-    passes: int = 0  # refinements after the first estimate
-    obstacle: str = ""  # why the tolerance was not reached, or ""
+    n_e: int  # tissue unknowns of the mesh that was estimated [1]
+    finer: int  # tissue unknowns of the mesh that it was compared with [1]
+    # finer mesh: "order", the next order on the same cells, or "graded", another mesh, which meets the zone; "coarser":
+    # the error is that of a mesh of fewer cells, about as large or larger
+    by: str
+    tolerance: float | None = None  # tolerance of the scene [1], or None
+    passes: int = 0  # number of refinements after the first estimate [1]
+    obstacle: str = ""  # reason why the tolerance was not reached, or ""
     offer: tuple[float, int] | None = None  # tolerance and unknowns of a graded mesh that does better, or None
-    seconds: float = 0.0  # what the estimate took, the slowest rank
+    seconds: float = 0.0  # time of the estimate on the slowest rank [s]
 
     def corrected(self, outputs: Array) -> Array:
         """Outputs y_h + delta y (steps + 1, p) [m, rad]."""
@@ -59,10 +61,10 @@ class MeshEstimate:
 
 @dataclass
 class Stopwatch:
-    """Seconds of named stages; the slowest rank counts."""
+    """Times of named stages, each that of the slowest rank."""
 
-    comm: MPI.Intracomm
-    seconds: dict[str, float] = field(default_factory=dict)
+    comm: MPI.Intracomm  # ranks that are timed
+    seconds: dict[str, float] = field(default_factory=dict)  # time of each stage by its name, on the slowest rank [s]
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -76,15 +78,7 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class Model:
-    """A scene made ready to run.
-
-    Attributes:
-        scene: the validated scene.
-        space: mesh, function space and block dof maps.
-        system: the operators.
-        inventory: compiled forms and allocated operators.
-        watch: seconds of mesh and assembly.
-        accuracy: estimate of the error of the mesh, where the scene has a tolerance.
+    """The full finite element model of a scene.
 
     >>> import softgrasp as sg
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]"])
@@ -93,11 +87,17 @@ class Model:
     """
 
     scene: Scene
+    """The validated scene, on every rank."""
     space: Discretisation
+    """Mesh, function space, and split of its nodes into contact and free ones."""
     system: BlockSystem
+    """Operators M, K, D, T, G of hand and tissue, matrices distributed over the ranks."""
     inventory: Inventory
+    """Names of compiled forms and of allocated operators."""
     watch: Stopwatch
+    """Time of each stage of building and running, on the slowest rank [s]."""
     accuracy: MeshEstimate | None = None
+    """Estimate of the error of the mesh; None where the scene has no tolerance."""
 
     @property
     def states(self) -> int:
@@ -137,8 +137,9 @@ class Model:
         Only sums of matrices that are there; nothing is assembled. The error of the mesh is another and is left out.
 
         Args:
-            lam, mu: Lame parameters [Pa]; None keeps those of each layer.
-            rho: density [kg/m^d]; None keeps it.
+            lam: first Lame parameter [Pa]; None keeps that of each layer.
+            mu: shear modulus [Pa]; None keeps that of each layer.
+            rho: density [kg/m^3]; None keeps that of each layer.
 
         Raises SceneError: a number is not positive (lam: not above -2 mu / d), or not finite.
         """

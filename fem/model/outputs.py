@@ -10,6 +10,7 @@ import numpy as np
 
 from softgrasp.fem.columns import Columns, hand_columns, labels
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.scene.scene import Scene
@@ -124,9 +125,10 @@ def _region(system: BlockSystem, name: str, box: Array, i: int) -> Output:
 
 
 def _inside(system: BlockSystem, point: list[float], i: int) -> None:
-    low, high = system.layout.bounds()
+    layout = system.layout
+    low, high = bounding_box(layout.comm, np.vstack([layout.nodes, layout.held]))  # the hand may hold whole sides
     p = np.asarray(point, dtype=float)
-    slack = 0.05 * float((high - low).max())  # free nodes end one cell short of the contact zone
+    slack = 0.05 * float((high - low).max())  # a point that was read off a picture
     if (p < low - slack).any() or (p > high + slack).any():
         raise SceneError(
             f"control.outputs[{i}].point = {list(point)} lies outside the body, which spans "

@@ -15,7 +15,7 @@ import dolfinx.mesh
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.errors import SceneError, agree
+from softgrasp.fem.errors import SceneError, raise_on_all_ranks
 from softgrasp.fem.mesh.check import longest_edges, sort_facets
 from softgrasp.fem.mesh.grading import (
     BISECTION,
@@ -79,7 +79,7 @@ def refined_mesh(comm: MPI.Intracomm, scene: Scene, tolerance: float | None = No
     if by_lines(scene):
         return _lined(comm, scene, refine, goal)
     whole: Whole | None = None
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         if comm.rank == 0:
             whole = _bisected(scene, refine, goal)
     return distribute(comm, whole)

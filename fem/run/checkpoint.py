@@ -19,7 +19,7 @@ from softgrasp.fem.checksums import (
     write_arrays,
     write_manifest,
 )
-from softgrasp.fem.errors import CheckpointError, agree, shortened
+from softgrasp.fem.errors import CheckpointError, raise_on_all_ranks, shortened
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.mesh.scene_hash import scene_hash
@@ -27,42 +27,42 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 
 FORMAT = 6
-FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # what a run shows and keeps, not what it computes
+FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # keys of [output] that change no number of a run
 FREE = ("name", "description", "reduction", "study")
 OLD = ("*step*-rank*", "*frame*.npz")  # patterns of the files that a new manifest makes useless
 
 
 @dataclass(frozen=True)
 class RestartState:
-    """What a run needs to go on bit by bit: this rank's share of its arrays, and a few numbers."""
+    """State of a run from which it continues bit by bit: this rank's share of its arrays, and a few numbers."""
 
     run: str  # name of the run
-    step: int  # last step taken, n
-    legs: list[int]  # steps at which it was started and resumed
-    beside: dict[str, str]  # names and SHA-256 of further files in the checkpoint's folder; rank 0's count
-    state: Array  # local [z; v_z]
-    r: Array  # local rows of the right-hand side of the next step
-    pending: Array  # load that it still lacks
-    hand_q: Array  # hand so far, (n + 1, n_s)
-    hand_v: Array
-    outputs: Array  # this rank's share of the outputs so far, (n + 1, components)
-    snapshots: Array  # stored columns
-    loads: Array  # with ``pulls`` what the work of the loads needs, (n, n_s)
-    pulls: Array  # (n + 1, n_s or 2 n_s)
-    energies: Array  # dissipated, at the start, largest [J]
-    residual_first: float  # relative, of the first solve
-    forces: Array | None = None  # on the hand so far, (n, n_s); None where the motion is prescribed
-    solver_rows: Array | None = None  # vectors that the iterations of finite strain or of a solver remember, or None
-    solver_numbers: Array | None = None  # numbers that they remember, or None
+    step: int  # number n of the last step [1]
+    legs: list[int]  # numbers of the steps at which the run was started and resumed
+    beside: dict[str, str]  # SHA-256 of each further file of the folder by its name; rank 0's is written
+    state: Array  # state [z; v_z] of this rank's nodes, (2 n_local,) [m; m/s]
+    r: Array  # right-hand side of the next step, (n_local,) [N]
+    pending: Array  # coefficients of the load that ``r`` lacks, (n_s,)
+    hand_q: Array  # displacement of the hand so far, (n + 1, n_s) [m, rad]
+    hand_v: Array  # velocity of the hand so far, (n + 1, n_s) [m/s, rad/s]
+    outputs: Array  # this rank's share of the outputs so far, (n + 1, components) [m, rad]
+    snapshots: Array  # stored states of this rank's nodes, one a column
+    loads: Array  # coefficients c of the load G c of each step so far, (n, n_s)
+    pulls: Array  # products G'w of each step so far, (n + 1, n_s or 2 n_s); c'G'w is half the work of the load
+    energies: Array  # dissipated, initial and largest energy, (3,) [J]
+    residual_first: float  # relative residual of the first solve [1]
+    forces: Array | None = None  # force on the hand so far, (n, n_s) [N, N m]; None where the motion is prescribed
+    solver_rows: Array | None = None  # vectors kept by the iterations of finite strain or of a solver, or None
+    solver_numbers: Array | None = None  # numbers kept by these iterations, or None
 
     def arrays(self) -> dict[str, Any]:
-        """What goes into this rank's file, by its name there."""
+        """Arrays of this rank's file, by their names there."""
         names = [field.name for field in fields(self)[4:]]
         return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     @property
     def size(self) -> int:
-        """About what this rank's file takes [byte]."""
+        """Approximate size of this rank's file [byte]."""
         return sum(np.asarray(array).nbytes for array in self.arrays().values())
 
 
@@ -79,7 +79,7 @@ def write_checkpoint(state: RestartState, scene: Scene, layout: BlockLayout, dir
     comm = layout.comm
     manifest = directory / "checkpoint.json"
     name, sha256 = f"{state.run}-step{state.step}-rank{comm.rank}.npz", ""
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         try:
             sha256 = write_arrays(directory / name, {"numbering": _numbering(layout), **state.arrays()})
         except OSError as error:
@@ -87,7 +87,7 @@ def write_checkpoint(state: RestartState, scene: Scene, layout: BlockLayout, dir
                 f"{directory}: the restart file cannot be written ({error}); free the disk"
             ) from error
     files = comm.gather((name, sha256))
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         if files is not None:
             _write_manifest(state, scene, manifest, files)
     return manifest
@@ -119,7 +119,7 @@ def read_checkpoint(scene: Scene, layout: BlockLayout, directory: Path) -> Resta
     Raises:
         CheckpointError: no restart file, a damaged one, or one of another scene, rank count, mesh numbering or format.
     """
-    with agree(layout.comm):
+    with raise_on_all_ranks(layout.comm):
         manifest = directory / "checkpoint.json"
         entry = _fitting(scene, layout.comm.size, manifest, read_manifest(manifest, FORMAT))
         name, sha256 = entry["files"][layout.comm.rank]
@@ -138,7 +138,7 @@ def check_ranks(comm: MPI.Intracomm, directory: Path) -> None:
 
     Raises CheckpointError: no restart file, a damaged one, or one of another rank count.
     """
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         if comm.rank == 0:
             manifest = directory / "checkpoint.json"
             _same_ranks(manifest, read_manifest(manifest, FORMAT), comm.size)

@@ -6,9 +6,9 @@ With w = z_mid - z_n, s = 2/dt, pi = M v and the force f_alg of `softgrasp.fem.s
     R(w) = (s^2 M + s D) w + f_alg(z_n, w) - s pi_n - G c = 0,   z_{n+1} = z_n + 2 w,   s pi_{n+1} = 2 s^2 M w - s pi_n:
 
 the linear step with one more load, -(f_alg - K z_mid). The energy W + v'pi/2 changes by the work 2 c'G'w of the load,
-less what D dissipates, and by 2 w'R; so a step ends with a bit of a correction that makes w'R = 0 to first order.
-A step that does not converge is taken in 2, 4, .. 16 parts under the same load, that of the whole step where hand
-or controller answer to the tissue.
+less what D dissipates, and by 2 w'R; so a step ends with a fraction of a correction that makes w'R = 0 to first order.
+A step that does not converge is divided into 2, 4, .. 16 substeps under the same load, that of the whole step where
+hand or controller respond to the tissue.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import SAME, Array, PETSc, combine, led, total
+from softgrasp.fem.petsc import SAME, Array, PETSc, combine, driven_by_root, total
 from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState, viscosity
 from softgrasp.fem.solve.solvers import ITERATIVE
-from softgrasp.fem.strain.body import Body
+from softgrasp.fem.strain.body import HyperelasticBody
 from softgrasp.fem.strain.newton import Counts, NewtonFigures, Pairs, QuasiNewton, Root
 from softgrasp.fem.strain.points import whole_points
 
-PARTS = 16  # most of a step
-KEPT = 2  # steps that the first guess is extrapolated from
-Begin = tuple[PETSc.Vec, Array, Array, float]  # z, s pi and v / s on the rows here, and what is dissipated
+MOST_SUBSTEPS = 16  # largest number of substeps of a step [1]
+KEPT = 2  # steps that the first guess is extrapolated from [1]
+Begin = tuple[PETSc.Vec, Array, Array, float]  # z, s pi, v / s on the rows here, and the dissipated energy [J]
 
 
 class FiniteStrainMidpoint(TissueMidpoint):
@@ -38,8 +38,9 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     Attributes:
         r: s pi_n on the rows here, in place of the linear step's right-hand side.
-        counts: see there.
-        price: about how many iterations cost as much as a tangent and its factor, from sizes: the same in every run.
+        counts: convergence record of the run.
+        refactor_cost: iterations that take about as long as a tangent and its factor [1], estimated from sizes, so
+            that it is the same in every run.
     """
 
     def _parts(self) -> tuple[PETSc.Mat, ...]:
@@ -56,7 +57,10 @@ class FiniteStrainMidpoint(TissueMidpoint):
             self.dot = lambda a, b: self.over_ranks(float(np.dot(a, b)))
         if self.operators.whole:
             points = whole_points(points, self.comm, self.operators.enter(np.arange(system.layout.n_e)))
-        self.body, self.tol = Body(points, system.materials, None if self.operators.whole else system.K_ee), points.tol
+        self.body, self.tol = (
+            HyperelasticBody(points, system.materials, None if self.operators.whole else system.K_ee),
+            points.tol,
+        )
         if not self.comm.allreduce(self.body.kernel is not None, MPI.LAND):
             self.body.kernel = None  # ranks that hold all rows compute the same bits
         self.inertia, self.drag = (*self.operators.parts, None)[:2]
@@ -69,20 +73,21 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.newton = QuasiNewton(self._residual, self._apply, lambda w: self._renew(self.at.array_r + w), pairs)
         self.past: deque[Array] = deque(maxlen=KEPT)
         self.tangent_at: Array | None = None
-        self.counts, self.price = Counts(), self._price()
-        self.parts, self.jump, self.feedback = 1, None, None
+        self.counts, self.refactor_cost = Counts(), self._refactor_cost()
+        self.substeps, self.jump, self.feedback = 1, None, None
         self.load = self.right = np.zeros_like(self.r_array)
         self.last = 0.0
         self._propagate = self._carry_on
 
-    parts: int  # into which the step in work is divided
-    jump: Array | None  # of the velocity over a divided step
-    rate: Array  # (v_0 + v_1) / 2s of a divided step, on the rows here
-    feedback: Feedback | None
-    sensed: Array  # p of feedback
-    now: TissueState  # where the step in work begins
+    substeps: int  # number of substeps of the step in work, 1 without substepping [1]
+    jump: Array | None  # change of the velocity over a substepped step, rows here [m/s]; None without substeps
+    rate: Array  # (v_0 + v_1) / 2s of a substepped step, on the rows here [m]
+    feedback: Feedback | None  # dependence of the load on the tissue; None for a prescribed load
+    sensed: Array  # p = N'w of the feedback, (m,)
+    now: TissueState  # state at the beginning of the step in work
 
-    def _price(self) -> float:
+    def _refactor_cost(self) -> float:
+        """Iterations that take about as long as a tangent and its factor [1]: entries of the factor over 4 n_e."""
         if self.solver.name in ITERATIVE:
             return 8.0
         nz = self.solver.ksp.getPC().getFactorMatrix().getInfo()["nz_used"]
@@ -109,8 +114,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.body.force(self.trial, self.f)
         self.counts = Counts(min_det=self.counts.min_det, scale=float(np.sqrt(self.dot(self.f_array, self.f_array))))
 
-    def join(self, state: TissueState) -> None:
-        """Take a state over whose r is set. Collective."""
+    def adopt(self, state: TissueState) -> None:
+        """Continue from a state whose r is set. Collective."""
         self.now = state
         self._arrive(self._gathered_z(state), check=True)
 
@@ -128,14 +133,14 @@ class FiniteStrainMidpoint(TissueMidpoint):
         return W + float(total(self.comm, np.array([np.dot(v, momentum)]))[0]) / 2
 
     def figures(self) -> NewtonFigures:
-        """How the steps converged. Collective."""
+        """Convergence of the steps so far. Collective."""
         counts, least = self.counts, self.counts.min_det
         least = least if self.operators.whole else float(self.comm.allreduce(least, MPI.MIN))
         mean = counts.iterations / max(counts.steps, 1)
-        return NewtonFigures(mean, counts.most, counts.factors, least, counts.divided)
+        return NewtonFigures(mean, counts.most, counts.factors, least, counts.substepped)
 
-    def memory(self) -> dict[str, Array]:
-        """What a restart needs beside r and the state: tangent, pairs, last steps, counts; rows as they lie here."""
+    def restart_arrays(self) -> dict[str, Array]:
+        """Further arrays of a restart file: point of the tangent, last steps and pairs by rows, and counts."""
         pairs = self.newton.pairs
         tangent = [] if self.tangent_at is None else [self.tangent_at]
         rows = [self.operators.leave(x) for x in (*tangent, *self.past, *pairs.dx, *pairs.dr)]
@@ -143,8 +148,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
         numbers = np.array([*sizes, *vars(self.counts).values()], dtype=float)
         return {"solver_rows": np.array(rows).reshape(len(rows), len(self.r_array)), "solver_numbers": numbers}
 
-    def recall(self, rows: Array | None, numbers: Array | None) -> None:
-        """Take over what :meth:`memory` gave, after :meth:`join`. Collective."""
+    def restore(self, rows: Array | None, numbers: Array | None) -> None:
+        """Continue with what :meth:`restart_arrays` returned, after :meth:`adopt`. Collective."""
         if rows is None or numbers is None:
             return
         tangents, past, count, newest = (int(n) for n in numbers[:4])
@@ -175,7 +180,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
             feedback: what hand and controller add as the tissue moves; None where they do not depend on it.
 
         Raises:
-            SolverError: no convergence, not even in parts of the step; the message names the cell with the smallest J.
+            SolverError: no convergence, not even by substepping; the message names the cell with the smallest J.
         """
         self.feedback, self.jump, counts = feedback, None, self.counts
         self.load = self.G @ c
@@ -183,35 +188,35 @@ class FiniteStrainMidpoint(TissueMidpoint):
         counts.scale = max(counts.scale, math.sqrt(self.dot(self.right, self.right)))
         past = self.past
         guess = 2 * past[0] - past[1] if len(past) == KEPT else past[0] if past else np.zeros_like(self.w_array)
-        if counts.first >= 0 and counts.spent >= self.price:
+        if counts.first >= 0 and counts.iterations_since_factor >= self.refactor_cost:
             self._renew_about(guess)
         root = self._find(guess)
-        if root.spent < 0:
-            root = self._divided(c)
+        if root.iterations < 0:
+            root = self._substepped(c)
         elif feedback is not None:
             self.sensed = self._dots(feedback.N.T, root.x)
             c = c + feedback.C @ self.sensed
         if self.jump is None:
             self.c = c
         self.w.array_w[:] = root.x
-        counts.first = root.spent if counts.first < 0 else counts.first
-        counts.spent += max(root.spent - counts.first, 0)
-        counts.iterations, counts.steps = counts.iterations + root.spent, counts.steps + 1
-        counts.most = max(counts.most, root.spent)
+        counts.first = root.iterations if counts.first < 0 else counts.first
+        counts.iterations_since_factor += max(root.iterations - counts.first, 0)
+        counts.iterations, counts.steps = counts.iterations + root.iterations, counts.steps + 1
+        counts.most = max(counts.most, root.iterations)
 
     def _find(self, guess: Array) -> Root:
-        """The root, moved to w'R = 0 by a small part of a correction made before. Collective."""
-        target = max(self.tol * self.parts * self.counts.scale, 4 * self.body.rounding)
+        """The root, moved to w'R = 0 by a small fraction of an earlier correction. Collective."""
+        target = max(self.tol * self.substeps * self.counts.scale, 4 * self.body.rounding)
         root = self.newton.find(guess, target)
-        if root.spent > 0 and (moved := self._balance(root)) is None:  # what is left of R does work: iterate on
+        if root.iterations > 0 and (moved := self._balance(root)) is None:  # the residual does work: iterate on
             finer = self.newton.find(root.x, max(target / 30, 4 * self.body.rounding))
-            root = root if finer.spent < 0 else finer._replace(spent=root.spent + finer.spent)
+            root = root if finer.iterations < 0 else finer._replace(iterations=root.iterations + finer.iterations)
             moved = self._balance(root)
-        self.last = root.norm / (self.parts * self.counts.scale) if self.counts.scale > 0 else 0.0
-        return root if root.spent < 1 or moved is None else root._replace(x=moved)
+        self.last = root.norm / (self.substeps * self.counts.scale) if self.counts.scale > 0 else 0.0
+        return root if root.iterations < 1 or moved is None else root._replace(x=moved)
 
     def _balance(self, root: Root) -> Array | None:
-        """The step w moved to w'R = 0 by a small part of a correction made before; None where none is large enough."""
+        """The step w moved to w'R = 0 by a small fraction of an earlier correction; None without a large enough one."""
         pairs = self.newton.pairs
         if not pairs.order:
             return None
@@ -223,7 +228,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     def _residual(self, w: Array) -> tuple[Array, float]:
         """R(w) and its norm, infinite where the law has no stress. Collective."""
-        n = self.parts  # s is n times as large in a part of a step
+        n = self.substeps  # s is n times as large in a substep
         self.trial.stateIncrease()
         self.trial_array[:] = w
         if not self._all(self.body.step(self.begin, self.trial, self.f)):
@@ -256,12 +261,12 @@ class FiniteStrainMidpoint(TissueMidpoint):
         if not self._all(self.body.sound(self.trial)):
             return False
         S = self.body.tangent(self.trial)
-        S.axpy(float(self.parts**2), self.inertia, SAME)
+        S.axpy(float(self.substeps**2), self.inertia, SAME)
         if self.drag is not None:
-            S.axpy(float(self.parts), self.drag, SAME)
+            S.axpy(float(self.substeps), self.drag, SAME)
         self.newton.pairs.clear()
         counts = self.counts
-        counts.factors, counts.first, counts.spent = counts.factors + 1, -1, 0
+        counts.factors, counts.first, counts.iterations_since_factor = counts.factors + 1, -1, 0
         self.tangent_at = z.copy()
         if not self.solver.renew(S):
             return False
@@ -276,38 +281,38 @@ class FiniteStrainMidpoint(TissueMidpoint):
         if not self._renew(self.at.array_r + w):
             self._renew(self.at.array_r)
 
-    # ---- parts of a step
+    # ---- substeps
 
-    def _divided(self, c: Array) -> Root:
-        """The step in 2 to 16 parts under one load, ``self.c``; sets ``jump``, ``rate`` and ``sensed``. Collective.
+    def _substepped(self, c: Array) -> Root:
+        """The step in 2 to 16 substeps under one load, ``self.c``; sets ``jump``, ``rate``, ``sensed``. Collective.
 
-        Raises SolverError: no number of parts converges.
+        Raises SolverError: no number of substeps converges.
         """
         feedback, self.feedback, at = self.feedback, None, self.at
         begin = at, self.r_array.copy(), self.operators.gather(self.now.v.array_r) / self.s, self.dissipated
-        while self.parts < PARTS:
-            self.parts *= 2
-            root = self._taken(c, begin) if feedback is None else self._balanced(c, feedback, begin)
+        while self.substeps < MOST_SUBSTEPS:
+            self.substeps *= 2
+            root = self._substeps(c, begin) if feedback is None else self._balanced(c, feedback, begin)
             if root is None:
                 continue
-            self.parts, self.past = 1, deque(maxlen=KEPT)
-            self.counts.divided += 1
+            self.substeps, self.past = 1, deque(maxlen=KEPT)
+            self.counts.substepped += 1
             self._renew_about(root.x)
             return root
-        self.parts = 1
+        self.substeps = 1
         J, place = self.body.lowest(self.body.J, None if self.operators.whole else self.comm)
         raise SolverError(
-            f"finite strain ({self.body.law.name}): no convergence (16 parts of the step did not help); in the cell at "
+            f"finite strain ({self.body.law.name}): no convergence (16 substeps did not help); in the cell at "
             f"{place} the last trial has det F = {J:.3g}: take more time.steps, a finer mesh or a gentler motion"
         )
 
     def _balanced(self, c: Array, feedback: Feedback, begin: Begin) -> Root | None:
-        """The parts under the load that they make hand and controller take, Powell's hybrid method. Collective."""
+        """The substeps under the load with which hand and controller respond, by Powell's hybrid method. Collective."""
         root: Root | None = None
 
         def miss(load: Array) -> Array:
             nonlocal root
-            root = self._taken(load, begin)
+            root = self._substeps(load, begin)
             if root is None:
                 raise ArithmeticError
             w = self._dots(feedback.N.T, root.x)
@@ -317,31 +322,33 @@ class FiniteStrainMidpoint(TissueMidpoint):
         from scipy.optimize import root as solve  # few runs need it
 
         try:
-            load = led(self.comm, miss, lambda ask: np.array(solve(ask, c, options={"xtol": 1e-13, "eps": 1e-6}).x))
+            load = driven_by_root(
+                self.comm, miss, lambda ask: np.array(solve(ask, c, options={"xtol": 1e-13, "eps": 1e-6}).x)
+            )
             largest = np.abs(miss(load)).max() / max(np.abs(load).max(), np.abs(c).max())
         except ArithmeticError:
             return None
         return root if self.comm.bcast(bool(largest <= 10 * self.tol)) else None
 
-    def _taken(self, load: Array, begin: Begin) -> Root | None:
-        """All parts of a step, each with a tangent of its own; None where one of them fails. Collective."""
+    def _substeps(self, load: Array, begin: Begin) -> Root | None:
+        """All substeps of a step, each with its own tangent; None where one does not converge. Collective."""
         at, r, v, self.dissipated = begin
         self.r.array_w[:], self.c, self.load = r, load, self.G @ load
         w, jump, count, self.at = np.zeros_like(r), np.zeros_like(r), 0, at.copy()
         try:
-            for _ in range(self.parts):
-                self.begin, self.right = self.body.start(self.at), self.parts * self.r_array + self.load
+            for _ in range(self.substeps):
+                self.begin, self.right = self.body.start(self.at), self.substeps * self.r_array + self.load
                 if not self._renew(self.at.array_r.copy()):
                     return None
                 root = self._find(np.zeros_like(w))
-                if root.spent < 0:
+                if root.iterations < 0:
                     return None
                 self.w.array_w[:] = root.x
                 self._add_momentum()
                 self.at.axpy(2.0, self.w)
-                w, jump, count = w + root.x, 2 * self.s * self.parts * root.x - jump, count + root.spent
+                w, jump, count = w + root.x, 2 * self.s * self.substeps * root.x - jump, count + root.iterations
             self.jump, self.rate = jump, v + jump / (2 * self.s)
-            return root._replace(x=w, spent=count)
+            return root._replace(x=w, iterations=count)
         finally:
             self.at.destroy()
             self.at, self.begin = at, self.body.start(at)
@@ -367,12 +374,12 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self._arrive(z)
 
     def _add_momentum(self) -> None:
-        """S pi -> 2 s^2 M w - s pi, in a part of a step with its own s, and what the drag takes. Collective."""
+        """S pi -> 2 s^2 M w - s pi, in a substep with its own s, and the work of the drag. Collective."""
         self.inertia.mult(self.w, self.y)
-        self.r.axpby(2.0 * self.parts, -1.0, self.y)
+        self.r.axpby(2.0 * self.substeps, -1.0, self.y)
         if self.drag is not None:
             self.drag.mult(self.w, self.y)
-            self.dissipated += 2 * self.parts * float(np.dot(self.w_array, self.y_array))
+            self.dissipated += 2 * self.substeps * float(np.dot(self.w_array, self.y_array))
 
     def residual(self) -> float:
         """|R| of the last step over the largest |s pi + G c| so far; the step was checked."""

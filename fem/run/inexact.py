@@ -110,15 +110,15 @@ class InexactMidpoint(TissueMidpoint):
         if self.operators.D is None:  # else the momentum is M v and asks for no S w
             self.r.axpy(self.a, self.defect)
 
-    def memory(self) -> dict[str, Array]:
-        """What a restart needs beside r and the state: the solutions of the last steps."""
+    def restart_arrays(self) -> dict[str, Array]:
+        """Further arrays of a restart file: the solutions of the last steps, and their products."""
         return {
             "solver_rows": self.previous.W.T,
             "solver_numbers": np.append(self.previous.gram, self.previous.count),
         }
 
-    def recall(self, rows: Array | None, numbers: Array | None) -> None:
-        """Take over what `memory` gave, after `join`. Collective."""
+    def restore(self, rows: Array | None, numbers: Array | None) -> None:
+        """Continue with what `restart_arrays` returned, after `adopt`. Collective."""
         if rows is None or numbers is None:
             return
         past = self.previous

@@ -47,11 +47,11 @@ def viscosity(system: BlockSystem, s: float) -> PETSc.Mat:
 
 @dataclass
 class TissueState:
-    """Relative displacement and velocity of the tissue as PETSc vectors that share one local array [z; v]."""
+    """Displacement and velocity of the tissue against the hand, as PETSc vectors on one local array."""
 
-    array: Array
-    z: PETSc.Vec
-    v: PETSc.Vec
+    array: Array  # [z; v] of this rank's nodes, (2 n_local,) [m; m/s]
+    z: PETSc.Vec  # displacement against the hand, on the first half of ``array``, (n_e,) [m]
+    v: PETSc.Vec  # velocity against the hand, on the second half of ``array``, (n_e,) [m/s]
 
 
 def state_on(array: Array, system: BlockSystem) -> TissueState:
@@ -66,14 +66,14 @@ def state_on(array: Array, system: BlockSystem) -> TissueState:
 
 
 class Feedback(NamedTuple):
-    """What a two-way coupled hand, or a controller, adds to the load G c of a step: G C p with p = N'w.
+    """Load G C p with p = N'w that a two-way coupled hand, or a controller, adds to the load G c of a step.
 
-    Where a step is divided, w is (z_1 - z_0) / 2 in the share 1 - speed of each column, (v_0 + v_1) / 2s in the rest.
+    In a substepped step w is (z_1 - z_0) / 2 in the share 1 - speed of each column, (v_0 + v_1) / 2s in the rest.
     """
 
-    C: Array  # (n_s, m)
-    N: Array  # on the rows here, (rows, m)
-    speed: Array  # (m,)
+    C: Array  # load coefficients of the m sensed components, (n_s, m)
+    N: Array  # sensing columns on the rows here, (rows, m)
+    speed: Array  # share of each column that senses the velocity [1], (m,)
 
 
 class TissueMidpoint:
@@ -89,12 +89,13 @@ class TissueMidpoint:
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 
     Attributes:
-        operators: on the rows here.
-        r, w, k: vectors on the rows here; ``r_array``, ``w_array``, ``k_array`` their arrays.
+        operators: operators of the step, on the rows here.
+        r: right-hand side of the step, on the rows here; ``r_array`` is its array.
+        w: half the change of z in the step, z_mid - z_n, on the rows here [m]; ``w_array`` is its array.
         c: coefficients of the load of the step in work, (n_s,).
         pending: coefficients p of the load that r still lacks between steps, h = r + G p, (n_s,).
         K2: -2 K, whose product one call adds to r.
-        k: K2 z; a step carries it where damping needs the old one.
+        k: K2 z, on the rows here [N]; carried from step to step where damping is on; ``k_array`` is its array.
         x: the rows of w that this rank owns, in the order of the state; w itself unless the vectors are whole here.
     """
 
@@ -112,7 +113,7 @@ class TissueMidpoint:
         self.G, self.rows = self.operators.G, self.operators.rows
         self.K2 = self.operators.K
         self.K2.scale(-2.0)
-        with self.operators.agree():
+        with self.operators.raise_on_all_ranks():
             self.solver: TissueSolver = make_solver(
                 self.operators.S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible, ordered
             )
@@ -192,15 +193,15 @@ class TissueMidpoint:
 
     def _set_momentum(self, state: TissueState) -> None:
         """Set r = s M v with no load pending. Collective."""
-        self.join(state)
+        self.adopt(state)
         y = state.z.duplicate()
         self.system.M_ee.mult(state.v, y)
         self.r.array_w[:] = self.s * self.operators.gather(y.array_r)
         y.destroy()
         self.c = self.pending = np.zeros_like(self.c)
 
-    def join(self, state: TissueState) -> None:
-        """Take a state over whose r is set. Collective."""
+    def adopt(self, state: TissueState) -> None:
+        """Continue from a state whose r is set. Collective."""
         self.K2.mult(self._gathered_z(state), self.k)
 
     def _gathered_z(self, state: TissueState) -> PETSc.Vec:
@@ -238,7 +239,7 @@ class TissueMidpoint:
         solve missed its tolerance.
         """
         self.Y = np.empty(self.G.shape, order="F")
-        with self.operators.agree():
+        with self.operators.raise_on_all_ranks():
             for j in range(self.Y.shape[1]):
                 self.r.array_w[:] = self.G[:, j]
                 self.solver.solve(self.r, self.w)
@@ -321,19 +322,19 @@ class TissueMidpoint:
         """
         load = self.G[self.rows] @ self.c
         square = total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]
-        with self.operators.agree():
+        with self.operators.raise_on_all_ranks():
             return self.solver.check(self.r, self.w, "the midpoint", float(np.sqrt(square)))
 
     def figures(self) -> NewtonFigures | None:
-        """How the steps converged; None where they are linear. Collective."""
+        """Convergence of the steps so far; None where they are linear. Collective."""
         return None
 
-    def memory(self) -> dict[str, Array]:
-        """What a restart needs beside r and the state."""
+    def restart_arrays(self) -> dict[str, Array]:
+        """Further arrays of a restart file, beside r and the state, by their names there."""
         return {}
 
-    def recall(self, rows: Array | None, numbers: Array | None) -> None:
-        """Take over what :meth:`memory` gave, after :meth:`join`. Collective."""
+    def restore(self, rows: Array | None, numbers: Array | None) -> None:
+        """Continue with what :meth:`restart_arrays` returned, after :meth:`adopt`. Collective."""
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""

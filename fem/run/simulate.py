@@ -13,7 +13,15 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.checksums import AGAIN
-from softgrasp.fem.errors import CheckpointError, Interrupted, Paused, ResourceError, SceneError, SolverError, agree
+from softgrasp.fem.errors import (
+    CheckpointError,
+    Interrupted,
+    Paused,
+    ResourceError,
+    SceneError,
+    SolverError,
+    raise_on_all_ranks,
+)
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.memory import solver_of
 from softgrasp.fem.model.outputs import Output, make_outputs
@@ -30,35 +38,35 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
 
-FRAMES, LIGHT, FEWEST = 60, 100_000, 10  # frames up to so many unknowns, and the fewest of larger bodies
+FRAMES, LIGHT, FEWEST = 60, 100_000, 10  # frames up to LIGHT unknowns, these unknowns, fewest frames beyond [1]
 Observer = Callable[["Run"], None]
 """Called between segments and at every frame; collective, may raise to end the run."""
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How to run, apart from what the scene says."""
+    """Options of a run that are no keys of the scene."""
 
-    directory: Path = Path("out")  # where checkpoints and streamed snapshots go
-    resume: bool = False  # continue from the checkpoint in ``directory``
-    until: int | None = None  # stop after this step and leave a checkpoint; None runs to the end
-    progress: Observer | None = None  # called with the :class:`Run` about five times a second
-    frame: Observer | None = None  # called with it at the start, at the end and at ``output.frames`` steps between
-    begin: Observer | None = None  # called with it once before the first step, when a checkpoint has been read
-    keep: Observer | None = None  # called with it before every checkpoint, to add files to :attr:`Run.beside`
-    few: int | None = None  # states kept in memory with output.snapshots = "auto", equally spaced; None keeps all
+    directory: Path = Path("out")  # folder of restart files and streamed snapshots
+    resume: bool = False  # whether to continue from the restart file in ``directory``
+    until: int | None = None  # number of the step after which to write a restart file and stop; None runs to the end
+    progress: Observer | None = None  # call with the :class:`Run` about five times a second
+    frame: Observer | None = None  # call with the run at the start, the end and ``output.frames`` steps between
+    begin: Observer | None = None  # call with the run before the first step, after a restart file was read
+    keep: Observer | None = None  # call with the run before every restart file, to add files to :attr:`Run.beside`
+    few: int | None = None  # number of states kept in memory with output.snapshots = "auto" [1]; None keeps all
 
 
 class Run(Stepped):
-    """One run in progress: the TS context and what it carries.
+    """One forward run in progress.
 
-    ``force``: feedback force on the hand; None takes the scene's motion.
+    ``force``: feedback force on the hand; None for the scene's motion.
 
     Attributes:
-        name: of this run and those that it resumes, in no other run; its files carry it.
-        begun: step at which this run was started or resumed.
-        legs: the same of all runs that led here, this one last.
-        beside: names and SHA-256 of further files in the checkpoint's folder; rank 0's count.
+        name: identifier in the names of the files of this run and of those that it resumes; unique.
+        begun: number of the step at which this run was started or resumed [1].
+        legs: number of the step at which each of the resumed runs began, this one last.
+        beside: SHA-256 of each further file in the checkpoint's folder, by name; that of rank 0 is written.
     """
 
     def __init__(self, model: Model, options: RunOptions, force: Force | None = None) -> None:
@@ -147,7 +155,7 @@ class Run(Stepped):
         self._check_force(before)
 
     def _check_force(self, begin: int) -> None:
-        with agree(self.layout.comm):  # a callable may differ between the ranks
+        with raise_on_all_ranks(self.layout.comm):  # a callable may differ between the ranks
             self.drive.check(begin, self.reached + 1)
 
     def force(self) -> Array:
@@ -199,7 +207,7 @@ class Run(Stepped):
             energies=np.array([midpoint.dissipated, self.initial_energy, self.peak_energy]),
             residual_first=self.residual_first,
             forces=None if self.drive.u is None else self.drive.u[:n],
-            **midpoint.memory(),
+            **midpoint.restart_arrays(),
         )
 
     def restore(self, saved: RestartState) -> None:
@@ -208,7 +216,7 @@ class Run(Stepped):
         Raises CheckpointError: the state is of another mesh numbering, or the streamed snapshots do not fit to it.
         """
         n, midpoint = saved.step, self.midpoint
-        with agree(self.layout.comm):
+        with raise_on_all_ranks(self.layout.comm):
             self.store.restore(saved.snapshots, n, saved.run)
             if len(saved.r) != len(midpoint.r_array):
                 raise CheckpointError(
@@ -230,15 +238,14 @@ class Run(Stepped):
         self.legs = [*(leg for leg in saved.legs if leg < n), n]
         for vector in (self.state.z, self.state.v, midpoint.r):
             vector.stateIncrease()
-        midpoint.join(self.state)
-        midpoint.recall(saved.solver_rows, saved.solver_numbers)
+        midpoint.adopt(self.state)
+        midpoint.restore(saved.solver_rows, saved.solver_numbers)
 
     def trajectory(self) -> Trajectory:
         """Gather the small results; the tissue stays distributed. Collective."""
         outputs, comm = self.outputs, self.layout.comm
-        y = total(comm, self.local_outputs * np.concatenate([np.full(o.size, o.weight) for o in outputs]))
         rigid = self.drive.q @ np.vstack([o.C_s for o in outputs]).T
-        y += rigid
+        y = rigid + total(comm, self.local_outputs * np.concatenate([np.full(o.size, o.weight) for o in outputs]))
         times = self.end * np.arange(self.steps + 1) / self.steps
         snapshots = self.store.finish(times, self.drive.q, self.drive.v)
         spent = comm.allreduce(self.seconds, MPI.MAX)
@@ -280,9 +287,7 @@ def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set
     Ten of them do not depend on the options: there the energy is sampled, the same in every run of a scene.
     """
     scene = run.model.scene
-    frames: set[int] = set()
-    if options.frame is not None:
-        frames = set(frame_steps(scene, run.layout.n_e))
+    frames = set[int]() if options.frame is None else set(frame_steps(scene, run.layout.n_e))
     every = scene.output.checkpoint_every
     checkpoints = set(range(every, run.steps, every)) if every else set()
     last = run.steps if options.until is None else min(options.until, run.steps)

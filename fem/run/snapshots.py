@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from softgrasp.fem.errors import CheckpointError, ResourceError, agree
+from softgrasp.fem.errors import CheckpointError, ResourceError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
@@ -139,7 +139,7 @@ class Hdf5Store(NoStore):
         self.directory, self.path = directory, directory / f"snapshots-rank{layout.comm.rank}.h5"  # of this rank
         count = steps // every + 1
         self.needed = 16 * layout.n_e * count
-        with agree(layout.comm):
+        with raise_on_all_ranks(layout.comm):
             if layout.comm.rank == 0:
                 directory.mkdir(parents=True, exist_ok=True)
                 free = shutil.disk_usage(directory).free
@@ -156,7 +156,7 @@ class Hdf5Store(NoStore):
         self.slots = [state_on(self.buffer[:, j], system) for j in range(self.width)]
         self.index = {int(s): j for j, s in enumerate(self.steps)}
         self.written = 0
-        with agree(layout.comm):
+        with raise_on_all_ranks(layout.comm):
             self._open(rows, run)
 
     def _open(self, rows: int, run: str | None) -> None:
@@ -196,7 +196,7 @@ class Hdf5Store(NoStore):
         end, comm = int(np.searchsorted(self.steps, step, side="right")), self.system.layout.comm
         if end > self.written:
             check_room(comm, [self.path], 8 * len(self.buffer) * (end - self.written))
-            with agree(comm):
+            with raise_on_all_ranks(comm):
                 try:
                     _reserve(self.path, 8 * (len(self.buffer) + 1) * (end - self.written) + MARGIN)
                     with h5py.File(self.path, "r+") as file:
@@ -238,7 +238,7 @@ class Hdf5Store(NoStore):
         layout, s = self.system.layout, self.steps
         sizes = layout.comm.gather(layout.n_local)
         nodes = layout.comm.gather(layout.nodes)
-        with agree(layout.comm):
+        with raise_on_all_ranks(layout.comm):
             if sizes is not None and nodes is not None:  # rank 0
                 self._join(sizes, nodes, times[s], q[s], v[s])
         return None

@@ -1,4 +1,4 @@
-"""PETSc TS takes the midpoint steps of a run in segments; the forward run and the closed loop share it."""
+"""Midpoint steps of a run by PETSc TS, in segments; the forward run and the closed loop share it."""
 
 from __future__ import annotations
 
@@ -17,20 +17,24 @@ from softgrasp.fem.solve.solvers import SolverUsed
 
 
 class Stepped(ABC):
-    """A run whose steps TS counts.
+    """A run whose steps PETSc TS performs.
 
     Args:
-        dt: step [s].
-        midpoint: factored step.
-        store: where the states go.
-        solver: name, reason and package.
+        layout: sizes and ownership of the unknowns.
+        dt: time step [s].
+        steps: number of steps of the whole run [1].
+        midpoint: factored midpoint step of the tissue.
+        store: memory or file that receives the states.
+        solver: name of the linear solver, reason of its choice, and package.
 
     Attributes:
-        state: at the last step taken.
-        reached: number of the last step taken.
-        seconds, counted: time and number of the steps taken by :meth:`advance_to`, without the checks.
+        state: state [z; v_z] of the tissue at the step ``reached`` [m; m/s].
+        reached: number of the last step done [1].
+        seconds: time of all steps by :meth:`advance_to`, without the checks [s].
+        counted: number of these steps [1].
         checking: time of the checks [s].
-        residual: relative, of the last solve that :meth:`check_step` looked at.
+        check_at: number of the step whose solve is checked next, -1 for none [1].
+        residual: relative residual of the last solve that :meth:`check_step` checked [1].
     """
 
     def __init__(
@@ -51,7 +55,7 @@ class Stepped(ABC):
 
     @abstractmethod
     def solve_step(self, n: int) -> None:
-        """Leave w and load of step n in the midpoint, and the hand's new state in its table. Collective."""
+        """Set w and load of step n in ``midpoint``, and the hand's new state in its table. Collective."""
 
     @abstractmethod
     def record(self, n: int) -> None:
@@ -101,7 +105,7 @@ class Stepped(ABC):
         ts.setTime(step * self.dt)
 
     def check_step(self, ts: Any, step: int) -> float:
-        """Let TS run up to a step number and check the solve of that step; its relative residual. Collective.
+        """Relative residual [1] of the solve of a step up to which TS runs. Collective.
 
         The residual needs the right-hand side, which the end of the step overwrites; so the check is part of the step,
         but not of its time. A step that is behind already is not checked again: the residual is that of the last check.
@@ -109,7 +113,7 @@ class Stepped(ABC):
         """
         self.check_at = step - 1
         self.advance_to(ts, step)
-        self.check_at = -1  # a run may be taken back to its start
+        self.check_at = -1  # a run may be set back to its start
         return self.residual
 
 

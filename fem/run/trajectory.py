@@ -1,4 +1,4 @@
-"""What a run of the full model returns."""
+"""Result of a run of the full model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What a run returns.
+    """Motion, outputs, force and figures of a run of the full model.
 
     >>> import softgrasp as sg
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=60"])
@@ -25,23 +25,40 @@ class Trajectory:
     (61, 2)
     """
 
-    times: Array  # time grid [s], shape (steps + 1,)
-    q_s: Array  # displacement of the hand [m, rad], shape (steps + 1, n_s), on every rank
-    v_s: Array  # its velocity [m/s, rad/s], alike
-    outputs: Array  # y = C_s q_s + C_z' z [m, rad], shape (steps + 1, components), on every rank
-    outputs_rigid: Array  # what they would be if the tissue moved rigidly with the hand, same shape
-    columns: Columns  # one per output component
-    snapshots: Snapshots | None  # stored states
-    # mean force of the robot on the hand in each step, by the midpoint rule that at t_n + dt/2: applied, or what a
-    # prescribed motion takes against inertia, tissue, gravity and drag [N, N m], shape (steps, n_s)
+    times: Array
+    """Time grid, on every rank, (steps + 1,) [s]."""
+    q_s: Array
+    """Displacement of the hand, on every rank, (steps + 1, n_s) [m, rad]."""
+    v_s: Array
+    """Velocity of the hand, on every rank, (steps + 1, n_s) [m/s, rad/s]."""
+    outputs: Array
+    """Outputs y = C_s q_s + C_z' z, on every rank, (steps + 1, components) [m, rad]."""
+    outputs_rigid: Array
+    """Outputs of tissue that moves rigidly with the hand, on every rank, (steps + 1, components) [m, rad]."""
+    columns: Columns
+    """Name, axis and unit of each output component, (components,)."""
+    snapshots: Snapshots | None
+    """Stored states [z; v_z] of this rank's nodes; None where they are not in memory."""
     force: Array
-    final: Array  # [z; v_z] of this rank's nodes at the end [m; m/s], shape (2 n_local,)
-    energy_drift: float  # |E_N - E_0 - work + dissipated| over the largest energy seen, dimensionless
-    residuals: tuple[float, float]  # relative residual of the first and the last solve
-    solver: SolverUsed  # name, reason and package
-    seconds: dict[str, float] = field(default_factory=dict)  # of each stage, "steps", "per_step", on the slowest rank
-    steps_timed: int = 0  # steps taken since the run was started or resumed
-    newton: NewtonFigures | None = None  # how the steps of finite strain converged; None where they are linear
+    """Mean force of the robot on the hand in each step, on every rank, (steps, n_s) [N, N m].
+
+    By the midpoint rule it is the force at t_n + dt/2: the one applied, or the one that a prescribed motion requires
+    against inertia, tissue, gravity and drag.
+    """
+    final: Array
+    """State [z; v_z] of this rank's nodes at the end, (2 n_local,) [m; m/s]."""
+    energy_drift: float
+    """|E_N - E_0 - work + dissipated| over the largest sampled energy [1]."""
+    residuals: tuple[float, float]
+    """Relative residuals of the first and of the last solve [1]."""
+    solver: SolverUsed
+    """Name of the linear solver, reason of its choice, and package."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Time of each stage, of all "steps" and "per_step", on the slowest rank [s]."""
+    steps_timed: int = 0
+    """Number of steps since the run was started or resumed [1]."""
+    newton: NewtonFigures | None = None
+    """Convergence of the steps at finite strain; None where they are linear."""
 
     @property
     def output_names(self) -> tuple[str, ...]:

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LibraryMaterial:
-    """One entry: E [Pa], nu [1], rho [kg/m3], and where the numbers come from."""
+    """One material of the library."""
 
-    young: float
-    poisson: float
-    rho: float
-    source: str
+    young: float  # Young's modulus E [Pa]
+    poisson: float  # Poisson's ratio nu [1]
+    rho: float  # density [kg/m3]
+    source: str  # origin of the numbers
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:

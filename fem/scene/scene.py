@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import ConfigDict, Field, PrivateAttr, model_validator
 
 from softgrasp.fem.scene.control import BASES, Control, ControlOutput, Loop, Reduction, Study
 from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, NonNegative, Positive, Section, Tissue
@@ -76,7 +76,7 @@ class FiniteStrain(Section):
 
 
 class Effects(Section):
-    """Everything is off unless named."""
+    """Effects; each is switched off unless it is named."""
 
     gravity: Dropped[Gravity] = Field(None, description="gravity {g [m/s2], hand_weight}; off unless given")
     damping: Dropped[Damping] = Field(None, description="damping {kind, beta [s], alpha [1/s], drag}; off unless given")
@@ -88,7 +88,7 @@ class Effects(Section):
 
 
 class Motion(Section):
-    """What the hand does."""
+    """Motion of the hand, or force on it."""
 
     target: Dropped[list[float]] = Field(
         None, description="final displacement of the hand [m], then its angles [rad] with effects.rotation"
@@ -136,7 +136,7 @@ class Time(Section):
 
 
 class Output(Section):
-    """What is kept of a run."""
+    """Results that are kept of a run."""
 
     snapshots: Literal["auto", "memory", "hdf5", "none"] = Field(
         "auto", description="where states go; auto: memory, in `simulate` the few that its warnings look at [no unit]"
@@ -157,31 +157,45 @@ class Output(Section):
 
 
 class Scene(Section):
-    """A whole scene; relative file names count from `directory`.
+    """A whole scene; relative file names start in `directory`.
 
     >>> import softgrasp as sg
     >>> sg.load_scene("paper_forward").tissue.cells
     [15, 30]
     """
 
-    name: Label = Field(min_length=1, description="short name [no unit]")
-    description: str = Field("", description="what the scene shows [no unit]")
-    tissue: Tissue = Field(description="the soft body [m, Pa, kg/m3]")
-    contact: Contact = Field(description="where the hand holds it [m]")
-    hand: Hand = Field(default_factory=Hand, description="the rigid hand [kg, kg m2, m]")
-    effects: Effects = Field(default_factory=Effects, description="physics that is on [various]")
-    motion: Motion = Field(default_factory=lambda: Motion(profile="hold"), description="what the hand does [m, rad, s]")
-    time: Time = Field(description="time grid and solver [s]")
-    control: Dropped[Control] = Field(None, description="control problem [various]; off unless given")
-    reduction: Reduction = Field(default_factory=Reduction, description="reduced models to compare [various]")
-    study: Study = Field(default_factory=Study, description="how studies judge [various]")
-    output: Output = Field(default_factory=Output, description="what is kept [no unit]")
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    name: Label = Field(min_length=1)
+    """short name [no unit]"""
+    description: str = Field("")
+    """purpose of the scene [no unit]"""
+    tissue: Tissue
+    """the soft body [m, Pa, kg/m3]"""
+    contact: Contact
+    """contact zone of hand and tissue [m]"""
+    hand: Hand = Field(default_factory=Hand)
+    """the rigid hand [kg, kg m2, m]"""
+    effects: Effects = Field(default_factory=Effects)
+    """effects that are switched on [various]"""
+    motion: Motion = Field(default_factory=lambda: Motion(profile="hold"))
+    """motion of the hand, or force on it [m, rad, s]"""
+    time: Time
+    """time grid and solver [s]"""
+    control: Dropped[Control] = Field(None)
+    """control problem [various]; off unless given"""
+    reduction: Reduction = Field(default_factory=Reduction)
+    """reduced models to compare [various]"""
+    study: Study = Field(default_factory=Study)
+    """tolerances and settings of studies [various]"""
+    output: Output = Field(default_factory=Output)
+    """results that are kept [no unit]"""
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
     _mesh_digest: str = PrivateAttr("")  # of the mesh file, once it was read
 
     @property
     def directory(self) -> Path:
-        """Where the scene file lies."""
+        """Folder of the scene file."""
         return self._directory
 
     @property

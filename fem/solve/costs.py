@@ -1,4 +1,4 @@
-"""What a solver costs on one core by the number of unknowns, and how that shrinks with the ranks: a model.
+"""Model of time and memory of each solver by the number of unknowns and ranks.
 
 `python -m benchmarks solvers` measures set-up and solves of every row and prints measured over modelled times.
 """
@@ -13,22 +13,22 @@ import numpy as np
 SolverName = Literal["cholesky", "mumps", "cg", "stars"]
 ITERATIVE = ("cg", "stars")
 
-Power = tuple[float, float]  # value at 1e5 unknowns and exponent
-GUESSED = 0.3  # of the iterations from zero at 1e-8: those of a step at 1e-4 that begins with the last solutions
-FEW_SOLVES = 20  # of an equilibrium, a mesh estimate or modes with one factor
-PARALLEL = 0.62  # time of work spread over ranks falls like ranks^-0.62: 0.65 of it on two, measured
+Power = tuple[float, float]  # value at 1e5 unknowns, and exponent of the number of unknowns
+GUESSED = 0.3  # iterations of a step to 1e-4 from the last solutions, over those from zero to 1e-8 [1]
+FEW_SOLVES = 20  # solves of an equilibrium, a mesh estimate or modes with one factor [1]
+PARALLEL = 0.62  # exponent p of the time ranks^-p of work spread over ranks [1]: 0.65 on two ranks, measured
 
 
 @dataclass(frozen=True)
 class Cost:
-    """One solver on elements of one kind."""
+    """Cost of one solver on elements of one kind, on one core."""
 
-    setup: Power  # [s]
-    pass_: Power  # a solve by a factor, or one iteration [s]
-    memory: Power  # [byte an unknown]
-    most: float  # unknowns up to which it was measured to be worth a choice; a factor does not fit beyond
-    fixed: float = 0.0  # set-up at any size [s]
-    iterations: tuple[float, float] = (1.0, 0.0)  # from zero to 1e-8, a + b sqrt(lambda / mu); 1 by a factor
+    setup: Power  # time of the set-up [s]
+    pass_: Power  # time of a solve by a factor, or of one iteration [s]
+    memory: Power  # memory of set-up and factor [byte per unknown]
+    most: float  # largest number of unknowns at which the solver is a candidate [1]; a factor does not fit beyond
+    fixed: float = 0.0  # time of the set-up that does not depend on the size [s]
+    iterations: tuple[float, float] = (1.0, 0.0)  # a, b of a + b sqrt(lambda / mu) iterations from zero to 1e-8 [1]
 
 
 # By solver, dimension and whether the order is 2 or more. Times of direct solvers follow their entries: n log n and
@@ -53,15 +53,15 @@ COSTS: dict[tuple[SolverName, int, bool], Cost] = {
 
 @dataclass(frozen=True)
 class Work:
-    """What is to be solved with one matrix."""
+    """Size and number of the solves with one matrix."""
 
-    n: int  # unknowns
-    dimension: int
-    order: int
-    ranks: int
-    solves: int
-    few: bool  # static ones, to 1e-12, half again the iterations of 1e-8; else steps
-    contrast: float  # largest lambda / mu of the materials
+    n: int  # number of unknowns [1]
+    dimension: int  # space dimension d
+    order: int  # polynomial order of the elements
+    ranks: int  # number of ranks [1]
+    solves: int  # number of solves with the matrix [1]
+    few: bool  # whether they are static solves to 1e-12, with half again the iterations of 1e-8; else time steps
+    contrast: float  # largest lambda / mu of the materials [1]
 
     def memory(self, name: SolverName, copies: int = 1) -> float:
         """Modelled memory of set-up and factor over all ranks [byte]."""
@@ -95,7 +95,7 @@ class Work:
         return direct if self.few and direct else names
 
     def leanest(self) -> SolverName:
-        """The candidate that takes the least memory."""
+        """The candidate with the least modelled memory."""
         return min(self.candidates(), key=self.memory)
 
     def _cost(self, name: SolverName) -> Cost:

@@ -11,17 +11,17 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, normalising, total
 
-COLUMNS = 8  # half of them leave a half more iterations, twice as many no fewer
-DEPENDENT = 1e-12  # of the largest squared length: directions of smooth motions that are rounding only
+COLUMNS = 8  # number of kept solutions [1]: with half of them iterations are a half more, with twice as many no fewer
+DEPENDENT = 1e-12  # squared length of a direction over the largest, below which it is rounding [1]
 
 
 class Previous:
     """The last solutions on the rows of this rank, with |w| = 1 in the norm of S.
 
     Attributes:
-        W: solutions, local rows (n, columns), Fortran order.
-        gram: W'S W, on every rank.
-        count: solutions ever added; the next one takes the place count % columns.
+        W: solutions, local rows (n, columns), Fortran order [m/sqrt(J)].
+        gram: W'S W, on every rank, (columns, columns) [1].
+        count: number of solutions ever added [1]; the next one goes to column count % columns.
     """
 
     def __init__(self, comm: MPI.Intracomm, n: int, columns: int = COLUMNS) -> None:
@@ -29,7 +29,7 @@ class Previous:
         self.W, self.gram = np.zeros((n, columns), order="F"), np.zeros((columns, columns))
 
     def guess(self, r: Array) -> Array:
-        """Local rows of W c for local rows of r; zero without solutions. Collective."""
+        """First guess W c, local rows (n,), for the local rows of r; zero without solutions. Collective."""
         known = min(self.count, len(self.gram))
         if not known:
             return np.zeros_like(r)
@@ -45,6 +45,6 @@ class Previous:
         self.count += 1
 
     def clear(self) -> None:
-        """Forget all."""
+        """Remove all solutions."""
         self.count = 0
         self.W[:], self.gram[:] = 0.0, 0.0

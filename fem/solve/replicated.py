@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softgrasp.fem.errors import agree
+from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, rows_on_all, whole_copy
 from softgrasp.fem.solve.cholesky import NodeOrder, dissect
@@ -18,25 +18,26 @@ from softgrasp.fem.system import BlockSystem
 
 @dataclass(frozen=True)
 class ReplicatedOperators:
-    """Stiffness, damping matrix and coupling as one rank steps them."""
+    """Operators of a step on the rows that this rank computes ("the rows here")."""
 
-    layout: BlockLayout
-    whole: bool  # all rows are here, on a communicator of this rank alone
-    order: NodeOrder | None  # of the rows here; None: that of the layout
-    rows: slice | NDArray[np.intp]  # places of the owned rows among those here
-    K: PETSc.Mat  # stiffness, a copy, in blocks of d x d on one rank: a quarter less memory traffic than single entries
-    G: Array  # coupling to the hand, (rows here, n_s)
-    S: PETSc.Mat  # matrix of the step; whoever factors it owns it
-    D: PETSc.Mat | None
-    M: PETSc.Mat | None  # mass, only beside D
-    parts: tuple[PETSc.Mat, ...] = ()  # further matrices that were asked for, on the same rows; whoever asked owns them
+    layout: BlockLayout  # sizes and ownership of the unknowns
+    whole: bool  # whether all rows are here, on a communicator of this rank alone
+    order: NodeOrder | None  # order of the rows here; None: that of the layout
+    rows: slice | NDArray[np.intp]  # places of the owned rows among those here, (n_local,)
+    # stiffness, a copy [N/m], (rows here, n_e); on one rank in blocks of d x d: a quarter less memory traffic
+    K: PETSc.Mat
+    G: Array  # coupling to the hand, (rows here, n_s) [kg, kg m]
+    S: PETSc.Mat  # matrix of the step, owned by the solver that factors it, (rows here, n_e) [N/m]
+    D: PETSc.Mat | None  # damping matrix of layers that differ in beta, (rows here, n_e) [N s/m]; else None
+    M: PETSc.Mat | None  # mass beside D, (rows here, n_e) [kg]; None without D
+    parts: tuple[PETSc.Mat, ...] = ()  # further matrices on the rows here, owned by the caller
 
-    def agree(self) -> AbstractContextManager[None]:
+    def raise_on_all_ranks(self) -> AbstractContextManager[None]:
         """Guard of a block that is a rank's own affair when it has all rows, and collective otherwise. Collective.
 
         The block must not communicate by itself.
         """
-        return agree(self.layout.comm) if self.whole else nullcontext()
+        return raise_on_all_ranks(self.layout.comm) if self.whole else nullcontext()
 
     def gather(self, local: Array) -> Array:
         """Rows here of a vector given by its owned rows. Collective."""

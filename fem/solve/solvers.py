@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from softgrasp.fem.errors import SolverError, agree
+from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, petsc_options, total, whole_copy
 from softgrasp.fem.solve.cholesky import (
@@ -37,15 +37,19 @@ REPEATED_RANKS = 4
 # which grows with the condition though w may be right. One step of refinement measures the error of w itself.
 DIRECT_RESIDUAL = 1e-8
 DIRECT_ERROR = 1e-6
+OUT_OF_MEMORY = 3  # PC_FACTOR_OUTMEMORY
+# Percent beyond the estimate that MUMPS reserves on each rank. PETSc's 20 has failed on a busy machine, where ranks
+# that lag take less of the work than planned; pages that are not touched cost nothing.
+WORKSPACE = 100
 PACKAGES = {"petsc": "PETSc", "mumps": "MUMPS"}  # PETSc's names of those that factor
 
 
 class SolverUsed(NamedTuple):
-    """What solved the tissue's equations of a run."""
+    """Linear solver of a run."""
 
-    name: SolverName
-    reason: str  # why this one
-    package: str  # that factored or preconditioned the matrix, as PETSc says it
+    name: SolverName  # name in time.solver
+    reason: str  # reason of the choice, in words
+    package: str  # package that factored or preconditioned the matrix, as PETSc reports it
 
 
 def choose_solver(
@@ -98,18 +102,18 @@ def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: 
 class TissueSolver:
     """A factored (or preconditioned) symmetric positive definite matrix of the tissue block."""
 
-    name: SolverName  # who solves
-    ksp: PETSc.KSP  # the PETSc solver; its vectors are those of S with mumps and cg only, so call `solve`
-    S: PETSc.Mat
-    tolerance: float  # relative residual that check accepts
-    # what solves without a detour through ``ksp``: the factor that every rank has whole, perhaps in an order of its own
+    name: SolverName  # name in time.solver
+    ksp: PETSc.KSP  # PETSc's solver; its vectors are those of S with mumps and cg only, so call `solve`
+    S: PETSc.Mat  # symmetric positive definite matrix, (rows, rows) [N/m]
+    tolerance: float  # largest relative residual that ``check`` accepts [1]
+    # factor that solves without ``ksp``: whole on every rank, perhaps in an order of its own
     # (softgrasp.fem.solve.cholesky), or that of one rank; None where the factor is spread or there is none
     factor: PETSc.Mat | OrderedFactor | None = None
-    stars: Stars | None = None  # the preconditioner of stars, which owns S
+    stars: Stars | None = None  # preconditioner of solver "stars", which owns S; else None
 
     @property
     def package(self) -> str:
-        """Who made the factor, asked of PETSc, or what preconditions the iteration."""
+        """Package of the factor, as PETSc reports it, or of the preconditioner."""
         pc = self.ksp.getPC()
         if self.stars is not None:
             return f"stars, {self.stars.package}"
@@ -280,6 +284,9 @@ def make_solver(
         ksp.setType("preonly")
         ksp.getPC().setType("cholesky")
         ksp.getPC().setFactorSolverType("mumps")
+        if S.comm.size > 1:
+            ksp.getPC().setFactorSetUpSolverType()
+            ksp.getPC().getFactorMatrix().setMumpsIcntl(14, WORKSPACE)
     try:
         _factor(ksp, S, name)
     except SolverError:
@@ -295,7 +302,7 @@ def _repeated(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float) 
     nodes = np.arange(layout.n_e // layout.dimension)
     ksp = make_ksp(whole_copy(S), prefix, "mumps")
     try:
-        with agree(S.comm.tompi4py()):
+        with raise_on_all_ranks(S.comm.tompi4py()):
             _factor(ksp, S, "mumps")
     except SolverError:
         ksp.destroy()
@@ -321,7 +328,7 @@ def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, 
         order, P = dissection.order, dissection.matrix(every)
         every.destroy()
     try:
-        with agree(S.comm.tompi4py()):
+        with raise_on_all_ranks(S.comm.tompi4py()):
             ksp = factor_blocks(P, prefix, "petsc" if layout.n_e <= FEW_LIMIT[layout.dimension] else "mumps")
     except SolverError:
         S.destroy()
@@ -344,7 +351,8 @@ def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
         ) from error
     reason = ksp.getPC().getFailedReason()
     if reason:
-        raise SolverError(f"{name}: set-up failed (reason {reason}); the matrix is not definite")
+        why = "out of memory or workspace; take more ranks" if reason == OUT_OF_MEMORY else "the matrix is not definite"
+        raise SolverError(f"{name}: set-up failed (reason {reason}); {why}")
 
 
 def _stars(S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float) -> TissueSolver:

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from softgrasp.fem.layout import BlockLayout, Patches
 from softgrasp.fem.petsc import Array, PETSc, petsc_options
 
-DEGREE = 2  # of the Chebyshev polynomial: one more gains a sixth of the iterations for 1.4 times the time
-COARSE_LIMIT = 20_000  # unknowns of the linear elements up to which one rank factors them
-BYTES = 2**26  # of the stars that are inverted at once
+DEGREE = 2  # degree of the Chebyshev polynomial: 3 saves a sixth of the iterations for 1.4 times the time
+COARSE_LIMIT = 20_000  # largest number of unknowns of the linear elements that one rank factors [1]
+BYTES = 2**26  # memory of the stars that are inverted at once [byte]
 # The upper bound of the spectrum of B S is PETSc's estimate; what lies below a tenth of it is left to the coarse level.
 SMOOTHER: dict[str, object] = {"mg_levels_ksp_chebyshev_esteig": "0,0.1,0,1.1", "mg_levels_ksp_type": "chebyshev"}
 FACTORED: dict[str, object] = {
@@ -42,11 +42,12 @@ ITERATED: dict[str, object] = {
 
 
 class Stars:
-    """The V-cycle of one matrix as the preconditioner of a solver; its patches are those of the layout.
+    """The V-cycle of one matrix as the preconditioner of a solver, on the patches of the layout.
 
     Args:
-        ksp: with its prefix and type; it gets operators and preconditioner here.
-        S: symmetric positive definite, as single entries (AIJ); stays the caller's, who may free it.
+        ksp: solver with its prefix and type; it receives operators and preconditioner here.
+        S: symmetric positive definite matrix as single entries (AIJ), owned by the caller, who may free it.
+        layout: layout of the unknowns, of order 2 or more.
 
     Attributes:
         factored: whether the linear elements are factored, so that the V-cycle is a fixed matrix.
@@ -66,7 +67,7 @@ class Stars:
         self.renew(S)
 
     def renew(self, S: PETSc.Mat) -> None:
-        """Take over another matrix of the same pattern. Collective."""
+        """Set up the V-cycle for another matrix of the same pattern. Collective."""
         d, ksp = self.layout.dimension, self.ksp
         for old in self.matrices:
             old.destroy()
@@ -98,7 +99,7 @@ class Stars:
 
     @property
     def package(self) -> str:
-        """Who solves the linear elements, asked of PETSc."""
+        """Package that solves the linear elements, as PETSc reports it."""
         pc = self.ksp.getPC().getMGCoarseSolve().getPC()
         return str(pc.getFactorSolverType() if self.factored else pc.getType()).upper()
 

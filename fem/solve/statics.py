@@ -15,7 +15,7 @@ from softgrasp.fem.solve.stiffness import static_columns
 from softgrasp.fem.system import BlockSystem
 
 if TYPE_CHECKING:
-    from softgrasp.fem.strain.body import Body
+    from softgrasp.fem.strain.body import HyperelasticBody
 
 
 def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Time | None = None) -> Array:
@@ -74,11 +74,11 @@ def finite_equilibrium(system: BlockSystem, solver: SolverName | None = None) ->
     Raises SolverError: no step of the load converges; the message names its share t, the cell with the smallest J, and
     J.
     """
-    from softgrasp.fem.strain.body import Body  # only scenes with finite strain pay for it
+    from softgrasp.fem.strain.body import HyperelasticBody  # only scenes with finite strain pay for it
 
     assert system.points is not None
     assert system.gravity is not None
-    body, comm = Body(system.points, system.materials), system.layout.comm
+    body, comm = HyperelasticBody(system.points, system.materials), system.layout.comm
     name = solver or choose_solver(system.layout, few=True)[0]
     z, f = system.K_ee.createVecs()
     load = z.duplicate()
@@ -105,7 +105,7 @@ def finite_equilibrium(system: BlockSystem, solver: SolverName | None = None) ->
 
 
 def _newton(
-    body: Body, system: BlockSystem, name: SolverName, z: PETSc.Vec, f: PETSc.Vec, load: PETSc.Vec, t: float
+    body: HyperelasticBody, system: BlockSystem, name: SolverName, z: PETSc.Vec, f: PETSc.Vec, load: PETSc.Vec, t: float
 ) -> bool:
     """Newton from z on for the load t G g, each correction halved until |f - t G g| falls; z moves. Collective."""
     comm, trial, p = system.layout.comm, z.duplicate(), z.duplicate()

@@ -13,7 +13,7 @@ from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc, to_scipy
 from softgrasp.fem.strain.compiled import LANES, library
 from softgrasp.fem.strain.laws import LAWS, Start, double_dot, green, stretches, volume_change
-from softgrasp.fem.strain.points import Points
+from softgrasp.fem.strain.points import QuadraturePoints
 
 DECLARATION = """
 void softgrasp_start(int d, int k, int p, const int *node, const double *G, const double *z, double *H0, double *j0,
@@ -37,7 +37,7 @@ class Kernel:
         J: det F at the end of the step tried last, (Q,).
     """
 
-    def __init__(self, points: Points, lam: Array, mu: Array, code: Any) -> None:
+    def __init__(self, points: QuadraturePoints, lam: Array, mu: Array, code: Any) -> None:
         (ffi, self.c), d, Q = code, points.d, len(points.vol)
         B = to_scipy(points.B)
         counts = np.diff(B.indptr[: Q + 1])  # the rows of a point have the same nodes
@@ -75,7 +75,7 @@ class Kernel:
         )
 
 
-class Body:
+class HyperelasticBody:
     """Points with materials; vectors have the distribution of the columns of B.
 
     ``pattern``: of the tangents; None: that of B'AB, which on some ranks has fewer columns of other ranks than K_ee.
@@ -84,7 +84,9 @@ class Body:
         rounding: what rounding in the stress mu F leaves of a force [N], in the norm of all rows.
     """
 
-    def __init__(self, points: Points, materials: tuple[LayerMaterial, ...], pattern: PETSc.Mat | None = None) -> None:
+    def __init__(
+        self, points: QuadraturePoints, materials: tuple[LayerMaterial, ...], pattern: PETSc.Mat | None = None
+    ) -> None:
         self.points, self.law = points, points.laws
         self.lam, self.mu = points.lame(materials)
         d, Q = points.d, len(points.vol)

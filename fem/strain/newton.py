@@ -1,4 +1,4 @@
-"""R(x) = 0 by a kept tangent with L-BFGS pairs [NW06], the tangent made anew where that does not converge."""
+"""R(x) = 0 by a kept tangent with L-BFGS pairs [NW06], the tangent factored anew where that does not converge."""
 
 from __future__ import annotations
 
@@ -12,56 +12,59 @@ import numpy as np
 from softgrasp.fem.petsc import Array
 
 PAIRS = 4  # on 60 x 120 cells 2 cost more iterations, 12 save none
-MOST, RENEW = 40, 8  # iterations, and after how many of them the tangent is made anew
-SMALLEST = 2.0**-10  # part of a correction
-GROWTH = 4.0  # of |R|, beyond which a correction is halved
+MOST = 40  # largest number of iterations [1]
+RENEW = 8  # iterations after which the tangent is factored anew [1]
+SMALLEST = 2.0**-10  # smallest fraction of a correction [1]
+GROWTH = 4.0  # growth of |R| beyond which a correction is halved [1]
 
 
 class Root(NamedTuple):
-    """Where R is small."""
+    """Result of the iteration: x with |R(x)| below the target, or the last x where that was not reached."""
 
-    x: Array
-    R: Array  # what is left there
-    norm: float  # |R|, infinite where there is no R
-    spent: int  # iterations, or -1 where R did not become small
+    x: Array  # last iterate, this rank's rows, (rows,)
+    R: Array  # residual R(x), (rows,)
+    norm: float  # |R(x)| over all ranks, infinite where the residual does not exist
+    iterations: int  # number of corrections, or -1 without convergence [1]
 
 
 @dataclass
 class Counts:
-    """What a restart needs: figures, the rule for a new tangent, the largest of |f(z_0)| and |s pi + G c| so far."""
+    """Convergence record of a run, kept in restart files: it also decides when the tangent is factored anew."""
 
-    iterations: int = 0
-    steps: int = 0
-    most: int = 0
-    factors: int = 0
-    divided: int = 0
-    first: int = -1  # iterations of the first step with this tangent
-    spent: int = 0  # iterations above these since then
-    min_det: float = np.inf
-    scale: float = 0.0
+    iterations: int = 0  # corrections of all steps so far [1]
+    steps: int = 0  # steps so far [1]
+    most: int = 0  # largest number of corrections of a step [1]
+    factors: int = 0  # tangents factored after the linear one [1]
+    substepped: int = 0  # steps solved by substepping [1]
+    first: int = -1  # corrections of the first step after the last factorisation [1]; -1 before that step
+    iterations_since_factor: int = 0  # corrections since then in excess of ``first`` a step [1]
+    min_det: float = np.inf  # smallest det F at the end of any step, on this rank's points [1]
+    scale: float = 0.0  # largest of |f(z_0)| and |s pi + G c| so far, over all ranks [N]
 
 
 @dataclass(frozen=True)
 class NewtonFigures:
-    """How the steps of a run converged."""
+    """Convergence of the steps of a run."""
 
-    mean: float  # iterations of a step [1]
-    max: int  # their largest number [1]
-    factors: int  # tangents factored after the linear one
-    min_det: float  # smallest det F at the end of any step
-    divided: int  # steps taken in parts
+    mean: float  # mean number of iterations of a step [1]
+    max: int  # largest number of iterations of a step [1]
+    factors: int  # tangents factored after the linear one [1]
+    min_det: float  # smallest det F at the end of any step, over all ranks [1]
+    substepped: int  # steps solved by substepping [1]
 
 
 class Pairs:
-    """The last pairs dx, dr of corrections and what they changed of R, in slots that are filled in turn.
+    """The last L-BFGS pairs: corrections dx and the changes dr of R, in slots that are filled in turn.
 
     Args:
-        dots: A x, summed over all rows.
-        rows: of a vector on this rank.
+        dots: products A x of rows on this rank, summed over all ranks, (m, rows) and (rows,) -> (m,).
+        rows: length of a vector on this rank [1].
 
     Attributes:
-        dx, dr: by slot, zero while it is empty, (PAIRS, rows).
-        order: slots from the oldest pair to the last.
+        dx: correction of each slot, zero in an empty one, (PAIRS, rows).
+        dr: change of R by the correction of each slot, (PAIRS, rows).
+        order: slots in use, that of the oldest pair first.
+        products: dx_i'dr_j for a pair i older than j, (PAIRS, PAIRS).
     """
 
     def __init__(self, dots: Callable[[Array, Array], Array], rows: int) -> None:
@@ -70,12 +73,12 @@ class Pairs:
         self.products = np.zeros((PAIRS, PAIRS))  # dx_i'dr_j of an older i and a newer j
 
     def clear(self) -> None:
-        """Forget all."""
+        """Remove all pairs."""
         self.order = []
         self.dx[:] = self.dr[:] = 0.0
 
     def append(self, dx: Array, dr: Array) -> None:
-        """Take a pair if it has a positive curvature, in the place of the oldest. Collective."""
+        """Keep a pair of positive curvature dx'dr in the slot of the oldest one. Collective."""
         slot = (self.order[-1] + 1) % PAIRS if self.order else 0
         if not self.dots(dx[None], dr)[0] > 0:
             return
@@ -84,11 +87,11 @@ class Pairs:
         self.multiply(slot)
 
     def multiply(self, slot: int) -> None:
-        """The products with a new dr. Collective."""
+        """Update ``products`` for a new dr. Collective."""
         self.products[:, slot] = self.dots(self.dx, self.dr[slot])
 
     def improve(self, solve: Callable[[Array], Array], R: Array) -> Array:
-        """About S^-1 R: the two loops of L-BFGS around a solve, four products of all pairs. Collective."""
+        """Approximation of J^-1 R, (rows,), J the Jacobian: L-BFGS's two loops around a solve with S. Collective."""
         if not self.order:
             return solve(R)
         g, a, b = self.products, np.zeros(PAIRS), np.zeros(PAIRS)
@@ -104,15 +107,15 @@ class Pairs:
 
 @dataclass(frozen=True)
 class QuasiNewton:
-    """Iterations that share their pairs, as the steps of a run do."""
+    """Quasi-Newton iteration for R(x) = 0; successive calls of ``find`` share its pairs."""
 
-    residual: Callable[[Array], tuple[Array, float]]  # R(x) and |R|, infinite or NaN where there is none
-    solve: Callable[[Array], Array]  # about S^-1 q for the tangent S factored last
-    renew: Callable[[Array], bool]  # factor the tangent at x; whether that worked
-    pairs: Pairs  # of the iterations so far
+    residual: Callable[[Array], tuple[Array, float]]  # x -> R(x) and |R|, infinite or NaN where R does not exist
+    solve: Callable[[Array], Array]  # q -> S^-1 q for the tangent S factored last, to its tolerance
+    renew: Callable[[Array], bool]  # x -> whether the tangent at x was factored
+    pairs: Pairs  # L-BFGS pairs of the iterations so far
 
     def find(self, x: Array, target: float) -> Root:
-        """From x until |R| <= target: a correction is halved while R is none or grows fourfold."""
+        """Iterate from x until |R| <= target, halving corrections with R not finite or fourfold. Collective."""
         R, norm = self.residual(x)
         if not math.isfinite(norm):
             x = np.zeros_like(x)

@@ -20,7 +20,7 @@ Ints = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Points:
+class QuadraturePoints:
     """The points of this rank's cells."""
 
     # gradient, rows distributed as the points and columns as the tissue; of the rank's d^2 Q rows the row (i d + j) Q +
@@ -47,7 +47,7 @@ class Points:
 
 
 def make_gradient(comm: MPI.Intracomm, gradients: Array, nodes: Ints, columns: tuple[int, int]) -> PETSc.Mat:
-    """The matrix B of :class:`Points` from the gradients of the nodes' shape functions. Collective.
+    """The matrix B of :class:`QuadraturePoints` from the gradients of the nodes' shape functions. Collective.
 
     Args:
         gradients: dN_a/dX_j in every point of every cell, (cells, points, nodes, d).
@@ -71,7 +71,7 @@ def make_gradient(comm: MPI.Intracomm, gradients: Array, nodes: Ints, columns: t
     return _petsc(B, ((d * d * Q, None), columns), d, comm)
 
 
-def whole_points(points: Points, comm: MPI.Intracomm, columns: Ints | None = None) -> Points:
+def whole_points(points: QuadraturePoints, comm: MPI.Intracomm, columns: Ints | None = None) -> QuadraturePoints:
     """All points on this rank alone, the columns of B in another order. Collective.
 
     ``columns``: number of each column in the layout's order; None keeps it.

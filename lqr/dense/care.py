@@ -23,12 +23,12 @@ UNSEEN = 1e4 * EPS
 class StateSpace:
     """E x' = A x + B u, y = C x, dense, with the weights of y'Qy + u'Ru."""
 
-    E: Array  # (N, N)
-    A: Array  # (N, N)
-    B: Array  # (N, m)
-    C: Array  # (p, N)
-    Q: Array  # (p, p)
-    R: Array  # (m, m)
+    E: Array  # descriptor matrix, regular, (N, N)
+    A: Array  # state matrix, (N, N)
+    B: Array  # input matrix, (N, m)
+    C: Array  # output matrix, (p, N)
+    Q: Array  # weight of the outputs, (p, p)
+    R: Array  # weight of the inputs, (m, m)
 
     @property
     def N(self) -> int:
@@ -38,13 +38,13 @@ class StateSpace:
 
 @dataclass(frozen=True)
 class DenseSolution:
-    """X of A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = 0 and what belongs to it."""
+    """X of A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = 0 with its gain, poles and errors."""
 
-    X: Array  # (n, n), symmetric
+    X: Array  # stabilising solution, symmetric, (n, n)
     K: Array  # feedback u = K x, -R^{-1} B'XE, (m, n)
     poles: Complex  # eigenvalues of E^{-1}(A + B K), (n,)
     residual: float  # ||Res||_F / ||C'QC||_F
-    backward: float  # ||Res||_F against the sum of the norms of the four terms
+    backward: float  # backward error: ||Res||_F over the sum of the norms of the four terms
     newton_steps: int  # accepted Newton steps after the Schur form
 
     @property
@@ -138,8 +138,8 @@ def riccati_schur(A: Array, G: Array, H: Array) -> tuple[Array, Complex, int]:
         T, U, stable = scipy.linalg.schur(hamiltonian, output="real", sort="lhp")
     except np.linalg.LinAlgError as error:  # eigenvalues that rounding moves over the axis while they are sorted
         raise ControlError(
-            f"the stable eigenvalues of the Hamiltonian matrix cannot be told from the others ({error}): Q and R are "
-            "too far apart, or some mode is hardly damped"
+            f"the stable eigenvalues of the Hamiltonian matrix cannot be separated from the others ({error}): Q and R "
+            "are too far apart, or some mode is hardly damped"
         ) from error
     values = block_eigenvalues(T)
     check_axis(hamiltonian, values, stable)

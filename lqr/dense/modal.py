@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from softgrasp.fem.errors import ResourceError, SolverError, agree
+from softgrasp.fem.errors import ResourceError, SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, rows_on_root, times_columns, to_scipy, total
 from softgrasp.fem.solve.modes import lowest_modes
@@ -33,14 +33,14 @@ NOISE = 100 * EPS  # of the largest row of Z: an entry of X beside it is roundin
 
 @dataclass(frozen=True)
 class TissueMatrices:
-    """Dense M_ee, K_ee, D_ee (k, k); G (k, n_s); C_z (k, p); B_z (k, m), in global numbering or any basis of z."""
+    """Dense operators of the tissue, in global numbering or any basis of k columns of z."""
 
-    M: Array
-    K: Array
-    D: Array
-    G: Array
-    C_z: Array
-    B_z: Array | None = None
+    M: Array  # mass M_ee, (k, k)
+    K: Array  # stiffness K_ee, (k, k)
+    D: Array  # damping D_ee, (k, k)
+    G: Array  # coupling to the hand, (k, n_s)
+    C_z: Array  # outputs of z, transposed, (k, p)
+    B_z: Array | None = None  # forces of the inputs, (k, m), where there is no hand; else None
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class ModalPlant:
     D: Array  # Phi' D_ee Phi, (k, k)
     g: Array  # Phi' G, (k, n_s); without a hand Phi' B_z, (k, m)
     c: Array  # outputs of the modes, (p, k)
-    space: StateSpace
+    space: StateSpace  # dense plant in the coordinates xi
 
 
 def gather_matrix(layout: BlockLayout, A: PETSc.Mat) -> Array | None:
@@ -167,7 +167,7 @@ def _modes_on_root(problem: RiccatiProblem, k: int) -> tuple[Array, Array]:
     system, layout = problem.system, problem.layout
     M, K = gather_matrix(layout, system.M_ee), gather_matrix(layout, system.K_ee)
     modes: tuple[Array, Array] | None = None
-    with agree(layout.comm):
+    with raise_on_all_ranks(layout.comm):
         if M is not None and K is not None:
             squares, vectors = scipy.linalg.eigh(K, M, subset_by_index=[0, k - 1])
             _check_held(squares[0], float(np.linalg.norm(K, 1) / np.diag(M).max()))
@@ -198,8 +198,8 @@ class ModeRates:
     """
 
     omega: Array  # natural frequencies [1/s], (k,)
-    own: Array  # delta_k, decay by the tissue's damping [1/s]
-    feedback: Array  # f_k, what optimal feedback would add alone [1/s]
+    own: Array  # delta_k, decay by the tissue's damping [1/s], (k,)
+    feedback: Array  # f_k, decay by optimal feedback without that damping [1/s], (k,)
     size: float  # frequency scale of the whole plant, for rounding [1/s]
 
     @property
@@ -308,7 +308,7 @@ class DenseRiccati:
         check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
         tissue = gather_tissue(problem)
         result: RiccatiSolution | None = None
-        with agree(comm):
+        with raise_on_all_ranks(comm):
             if tissue is not None:
                 result = self._solve_on_root(problem, tissue)
         return spread(layout, result)

@@ -32,9 +32,9 @@ class NoController(ControlError):
 class CertifiedController:
     """The small controller of a scene."""
 
-    controller: Controller  # what a robot runs
-    method: str  # basis that its gain came from
-    radius: SampledRadius  # of the plant under it from tick to tick, at the period, step and delay of the scene
+    controller: Controller  # the controller that a robot runs
+    method: str  # basis of its gain
+    radius: SampledRadius  # spectral radius of the full loop at the period, step and delay of the scene
 
 
 def make_controller(design: Design, order: int | None = None) -> Controller:

@@ -18,9 +18,9 @@ class LoopPlan:
     """How long the loop runs."""
 
     dt: float  # time step [s]
-    steps: int  # number
+    steps: int  # number of time steps
     settle: float  # time after which a rigid body under this gain is at the target [s]
-    note: str = ""  # why the scene's own end is not taken, or that it is too early; else empty
+    note: str = ""  # why the scene's own end is not used, or that it is too early; else empty
 
 
 def plan(design: Design, own_end: bool) -> LoopPlan:

@@ -33,16 +33,26 @@ ROUNDING = 1e-8  # of an eigenvalue on the unit circle
 class Design:
     """The optimal feedback of a scene."""
 
-    model: Model  # the built scene
-    problem: RiccatiProblem  # plant, outputs and weights
-    solution: RiccatiSolution  # Riccati solution and gain
-    target: Target  # where the loop goes
-    start: PlantState  # where it begins
-    error: Block  # start minus target, one column
-    diagnosis: Diagnosis  # what was known before the solve
-    gain_check: GainCheck  # compares gains with the optimal one
-    quality: LoopQuality  # closed loop of the full plant under the optimal gain
-    modal: bool  # the gain controls some modes only
+    model: Model
+    """The built scene."""
+    problem: RiccatiProblem
+    """Plant, outputs and weights."""
+    solution: RiccatiSolution
+    """Factor of the Riccati solution, and the optimal gain."""
+    target: Target
+    """State, input and outputs at which the loop comes to rest."""
+    start: PlantState
+    """State at t = 0."""
+    error: Block
+    """Start minus target, hand (2 n_s, 1), local rows (2 n_local, 1)."""
+    diagnosis: Diagnosis
+    """Warnings and estimated poles from before the solve."""
+    gain_check: GainCheck
+    """Comparison of any gain with the optimal one on the full plant."""
+    quality: LoopQuality
+    """Closed loop of the full plant under the optimal gain."""
+    modal: bool
+    """Whether the gain controls the lowest modes only."""
 
     @property
     def gain(self) -> Gain:
@@ -80,7 +90,7 @@ def design(
     """Optimal feedback u = u_bar + K (x - x_bar), K = -R^-1 B'XE, of a scene, checked on the full plant. Collective.
 
     Args:
-        watch: takes the seconds of "diagnosis", "are" and "judge".
+        watch: records the seconds of "diagnosis", "are" and "judge".
         progress: called after every step of the solver with its history entry.
         checkpoint: folder for the solver's restart files.
 
@@ -162,7 +172,7 @@ def _require_sampled(design: Design) -> None:
     if good is not None:
         steps = "" if good.steps == time.steps else f" with time.steps = {good.steps}"
         advice = (
-            f"it begins to be stable at control.loop.rate = {good.rate:.9g}{steps} (radius {good.radius:.6g}), so take "
+            f"it begins to be stable at control.loop.rate = {good.rate:.9g}{steps} (radius {good.radius:.6g}), so set "
             "a higher one"
         )
     raise SolverError(

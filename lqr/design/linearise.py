@@ -9,7 +9,7 @@ import numpy as np
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import PETSc, combine
 from softgrasp.fem.solve.statics import equilibrium
-from softgrasp.fem.strain.body import Body
+from softgrasp.fem.strain.body import HyperelasticBody
 from softgrasp.fem.system import BlockSystem, Damping
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import Target, hand_target
@@ -25,7 +25,7 @@ def linearised(model: Model) -> Model:
         return model
     if system.gravity is None:
         return replace(model, system=replace(system, points=None))
-    body, z = Body(system.points, system.materials, system.K_ee), system.K_ee.createVecRight()
+    body, z = HyperelasticBody(system.points, system.materials, system.K_ee), system.K_ee.createVecRight()
     z.array_w[:] = equilibrium(system)
     K = body.tangent(z).copy()
     K.setOption(PETSc.Mat.Option.SPD, True)

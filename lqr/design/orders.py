@@ -1,4 +1,4 @@
-"""Reduced gains of a scene: every basis at several orders, which are good, and proved bounds on what they cost."""
+"""Reduced gains of a scene: every basis at several orders, the best of them, and proved bounds on their excess cost."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class BasisGains:
 
     name: str  # key of softgrasp.lqr.reduced.bases.BASES
     family: BasisFamily | None  # its bases; None when the basis is refused
-    reports: tuple[GainReport, ...]  # one an order
-    refused: str = ""  # why there are none
+    reports: tuple[GainReport, ...]  # one gain per order, by ascending order
+    refused: str = ""  # why the basis is refused; empty when it is not
 
     def best(self, largest: int | None = None, least: int = 0) -> GainReport | None:
         """The stable gain of least cost, of any order or between two."""

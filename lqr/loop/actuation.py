@@ -15,13 +15,12 @@ from softgrasp.lqr.plant.checks import ControlError
 class Actuation:
     """How u = u_bar + K (x - x_bar) reaches the hand."""
 
-    # samples a second [Hz]; the input is computed at the start of a tick and held (a robot: 1000). None evaluates the
-    # law at the midpoint of every step, implicitly: the continuous feedback.
     rate: float | None = None
-    # ticks from a sample to the load that it commands; until the first one acts, u_bar does. Needs ``rate``.
+    """Samples per second, each held for one tick (a robot: 1000) [Hz]; None: continuous feedback, at the midpoints."""
     delay: int = 0
-    # bound on |u_i| [N, N m], a number or one per input (may be inf); None for none
+    """Ticks from a sample to its load, with u_bar before the first one; needs ``rate``."""
     limits: float | tuple[float, ...] | None = None
+    """Bound on |u_i|, one number or one per input, inf for none of one [N, N m]; None for none."""
 
     def bound(self, inputs: int) -> Array | None:
         """Limits as an array (inputs,), or None.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.checksums import write_arrays
-from softgrasp.fem.errors import agree, no_pipe
+from softgrasp.fem.errors import no_pipe, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
@@ -57,16 +57,6 @@ class Controller:
     ([...] where damping drags in space), and what is wrong at the start decays with the tissue's own damping. Nothing
     here talks to MPI or PETSc.
 
-    Attributes:
-        K: (n_s, N).
-        x_bar: state at the target, (N,).
-        u_bar: steady input [N, N m], (n_s,).
-        plant: the reduced plant that K was made for.
-        period: time between two steps [s].
-        limits: bounds on |u| [N, N m], (n_s,), inf for none.
-        scene_hash, layout_hash: of the scene and the mesh it was made for.
-        about: free text: method, weights, output names.
-
     Raises:
         ControlError: a shape is wrong, the plant does not begin with the hand, or the period is not positive.
 
@@ -77,14 +67,23 @@ class Controller:
     """
 
     K: Array
+    """Gain on the reduced state, (n_s, N)."""
     x_bar: Array
+    """Reduced state at the target, (N,)."""
     u_bar: Array
+    """Steady input at the target [N, N m], (n_s,)."""
     plant: SmallPlant
+    """Reduced plant that K was made for."""
     period: float = 1e-3
+    """Time between two calls of ``step`` [s]."""
     limits: Array | None = None
+    """Bounds on |u|, inf for none of one input [N, N m], (n_s,); None for none."""
     scene_hash: str = ""
+    """Digest of the scene; empty when unknown."""
     layout_hash: str = ""
+    """Digest of the mesh's free nodes; empty when unknown."""
     about: dict[str, Any] = field(default_factory=dict)
+    """Method, weights and output names, as free text."""
 
     def __post_init__(self) -> None:
         n_s, N = self.plant.B.shape[1], self.plant.N
@@ -124,7 +123,7 @@ class Controller:
         return np.minimum(np.maximum(u, self._lower), self._upper)
 
     def step(self, q_s: Array, v_s: Array) -> Array:
-        """One tick: take the measured hand, carry the tissue on, return the load [N, N m]."""
+        """One tick: the load [N, N m] from the measured hand, after one step of the tissue."""
         n_s, x = self.n_s, self._x
         step, accelerated, dragged, constant = self.model
         if not self._fresh:
@@ -200,7 +199,7 @@ def save_gain(path: Path, gain: Gain, target: PlantState, layout: BlockLayout, s
     """
     sorted_ = _sorted(layout)
     parts = layout.comm.gather(np.column_stack([gain.K_z, gain.K_v, target.z, target.v_z]))
-    with agree(layout.comm):
+    with raise_on_all_ranks(layout.comm):
         if parts is not None and sorted_ is not None:
             meta = {"format": FORMAT, "scene_hash": scene_hash, "layout_hash": sorted_[1]}
             arrays = {"K_s": gain.K_s, "q_s": target.q_s, "v_s": target.v_s}
@@ -215,7 +214,7 @@ def load_gain(path: Path, layout: BlockLayout, scene_hash: str | None = None) ->
     """
     sorted_, ranges = _sorted(layout), layout.comm.gather((layout.start, layout.start + layout.n_local))
     pieces: list[tuple[Array, ...]] | None = None  # each rank is sent its own rows
-    with agree(layout.comm):
+    with raise_on_all_ranks(layout.comm):
         if sorted_ is not None and ranges is not None:
             _, arrays = read_npz(path, {"layout_hash": sorted_[1], "scene_hash": scene_hash})
             try:

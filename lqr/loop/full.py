@@ -35,38 +35,52 @@ CHUNKS = 50  # segments of a run without frames: progress, and the check that th
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """What to keep of a run and whom to tell."""
+    """Snapshots, observers and the end of a run."""
 
-    snapshots: Literal["none", "memory", "hdf5"] = "none"  # where states go
-    every: int = 1  # a snapshot every so many steps
-    directory: Path = Path("out")  # where streamed snapshots go
+    snapshots: Literal["none", "memory", "hdf5"] = "none"  # storage of the states
+    every: int = 1  # steps between two snapshots
+    directory: Path = Path("out")  # folder of snapshots in HDF5
     frames: Sequence[int] = ()  # steps at which ``frame`` is called
-    # observer with ``run.state``, ``run.drive.q``, ``run.drive.v``, ``run.reached`` and ``run.dt``, the same as in a
-    # forward run
+    # observer of ``run.state``, ``run.drive.q``, ``run.drive.v``, ``run.reached`` and ``run.dt``, as in a forward run
     frame: Callable[[Any], None] | None = None
-    progress: Callable[[Any], None] | None = None  # called between segments, with ``run.reached`` and ``run.steps``
-    most: float = np.inf  # cost beyond which the run stops: no loop that works pays it
+    progress: Callable[[Any], None] | None = None  # observer of ``run.reached`` and ``run.steps``, between segments
+    most: float = np.inf  # cost J at which the run stops as divergent
 
 
 @dataclass(frozen=True)
 class LoopTrajectory:
-    """What a closed-loop run returns; small arrays are on every rank."""
+    """Result of a closed-loop run; small arrays are on every rank."""
 
-    times: Array  # grid [s], (steps + 1,)
-    q_s: Array  # displacement of the hand [m, rad], (steps + 1, n_s)
-    v_s: Array  # its velocity [m/s, rad/s], alike
-    inputs: Array  # u of each step [N, N m], (steps, n_s)
-    outputs: Array  # y = C_s q_s + C_z' z [m, rad], (steps + 1, p)
-    outputs_rigid: Array  # C_s q_s, the same without deformation, (steps + 1, p)
-    columns: Columns  # one per output component
-    cost: Array  # J up to each grid point, (steps + 1,)
-    final: PlantState  # the state at the end
-    snapshots: Snapshots | None  # stored states, or None
-    saturated: float  # share of the steps in which an input sat at its limit
-    residuals: tuple[float, float]  # relative residual of the first and the last solve
-    solver: SolverUsed  # name, reason and package
-    seconds: dict[str, float] = field(default_factory=dict)  # factor (with the responses) and steps; the slowest rank
-    newton: NewtonFigures | None = None  # how the steps of finite strain converged, or None
+    times: Array
+    """Time grid [s], (steps + 1,)."""
+    q_s: Array
+    """Displacement of the hand [m, rad], (steps + 1, n_s)."""
+    v_s: Array
+    """Velocity of the hand [m/s, rad/s], (steps + 1, n_s)."""
+    inputs: Array
+    """Input u of each step [N, N m], (steps, n_s)."""
+    outputs: Array
+    """y = C_s q_s + C_z' z [m, rad], (steps + 1, p)."""
+    outputs_rigid: Array
+    """C_s q_s, the outputs without deformation [m, rad], (steps + 1, p)."""
+    columns: Columns
+    """Label and unit of each output, p."""
+    cost: Array
+    """Cost J up to each grid point, (steps + 1,)."""
+    final: PlantState
+    """State at the end."""
+    snapshots: Snapshots | None
+    """Stored states; None where none were asked for."""
+    saturated: float
+    """Share of the steps with an input at its limit."""
+    residuals: tuple[float, float]
+    """Relative residuals of the first and the last solve."""
+    solver: SolverUsed
+    """Name, package and reason of the linear solver."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Time of "factor" (with the responses) and "steps" on the slowest rank [s]."""
+    newton: NewtonFigures | None = None
+    """Convergence of the steps of finite strain; None where the steps are linear."""
 
     @property
     def output_names(self) -> tuple[str, ...]:
@@ -136,7 +150,7 @@ class ClosedLoop:
                 :func:`softgrasp.lqr.plant.target.hand_target`.
             actuation: sampling, delay, limits; default none of them.
             start: x(0); default at rest with the hand at 0, in equilibrium under gravity.
-            options: what to keep and whom to tell.
+            options: snapshots, observers and the end of the run.
 
         Raises:
             ControlError: the target or the actuation does not fit, or the implicit input of a step is singular.

@@ -50,11 +50,11 @@ SHARE, LITTLE = 0.1, 1e-6  # of the excess and of the least cost, an allowance t
 
 @dataclass(frozen=True)
 class Course:
-    """From where, how long and through what all loops of a comparison run."""
+    """Start, duration and actuation that all loops of a comparison share."""
 
-    start: Block  # x(0) minus target, one column
+    start: Block  # x(0) minus target, hand (2 n_s, 1), local rows (2 n_local, 1)
     dt: float  # step of the midpoint rule [s]
-    steps: int  # number
+    steps: int  # number of time steps
     actuation: Actuation = field(default_factory=Actuation)  # sampling, delay and limits
     u_bar: Array | None = None  # steady input at the target, (n_s,) [N, N m]; None for none
 
@@ -63,13 +63,13 @@ class Course:
 class DualityGap:
     """Proved bound on the excess cost of one run."""
 
-    gap: float  # J(u) - min J is at most this; infinite when the run diverges
-    cost: float  # J(u) with what is to come
-    least: float  # proved lower bound of min J, J - gap of this run or of a better one from the same start
-    to_come: float  # |Z'E x_N|^2, what is to come after the end
-    end: float  # N dt [s]
-    after: float = 0.0  # allowance for the excess after the end; infinite where what is to come does not fall
-    excess: float = float("nan")  # dt sum |u - K x_mid|_R^2 over |Z'E x_0|^2; nan without an optimal law
+    gap: float  # proved upper bound of J(u) - min J; infinite when the run diverges
+    cost: float  # cost J(u), the optimal cost after the end included
+    least: float  # proved lower bound of min J: J - gap of this run or of a better one from the same start
+    to_come: float  # optimal cost |Z'E x_N|^2 after the end
+    end: float  # length N dt of the run [s]
+    after: float = 0.0  # allowance for the excess cost after the end; infinite where ``to_come`` does not fall
+    excess: float = float("nan")  # relative excess dt sum |u - K x_mid|_R^2 / |Z'E x_0|^2; nan without an optimal law
 
     @property
     def cost_excess_proved(self) -> float:

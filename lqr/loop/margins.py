@@ -6,7 +6,7 @@ The plant between two ticks of length h with a held load is x_{k+1} = A_d x_k + 
 
 With all inputs but the i-th closed the loop seen there is l_i = 1 / S_ii - 1; its gain may grow or shrink by the gain
 margins and its phase lag by the phase margin before the loop loses stability. The smallest singular value a of I + L
-bounds what all inputs bear at once: every gain in [1/(1+a), 1/(1-a)], every phase within 2 arcsin(a/2).
+bounds what all inputs withstand at once: every gain in [1/(1+a), 1/(1-a)], every phase within 2 arcsin(a/2).
 """
 
 from __future__ import annotations
@@ -28,33 +28,26 @@ NEAR = 60  # more around each resonance, where the phase turns at once
 class AxisMargins:
     """Margins of the loop seen at one input; nan where it has no such crossing."""
 
-    name: str  # of the input, with unit
-    gain_up: float  # factor > 1 by which its gain may grow; inf if by any
-    gain_down: float  # factor < 1 by which it may shrink; 0 if by any
-    phase: float  # lag that it bears [deg]
-    crossover: float  # frequency of that phase margin [rad/s]
-    delay: float  # dead time that it bears [s]
+    name: str  # label of the input, with unit
+    gain_up: float  # upper gain margin, factor > 1; inf without a limit
+    gain_down: float  # lower gain margin, factor < 1; 0 without a limit
+    phase: float  # phase margin [deg]
+    crossover: float  # frequency of the phase margin [rad/s]
+    delay: float  # delay margin [s]
 
 
 @dataclass(frozen=True)
 class LoopMargins:
-    """Frequency response of a loop and its margins.
+    """Frequency response of a loop and its margins."""
 
-    Attributes:
-        omega: frequencies up to that of half the ticks [rad/s], (F,).
-        response: l_i at them, (F, n_s).
-        axes: margins of each input.
-        distance: smallest singular value of I + L, at most 1 of use [1].
-    """
-
-    omega: Array
-    response: np.ndarray
-    axes: tuple[AxisMargins, ...]
-    distance: float
+    omega: Array  # frequencies up to the Nyquist frequency of the ticks [rad/s], (F,)
+    response: np.ndarray  # frequency response l_i of the loop at each input, (F, n_s)
+    axes: tuple[AxisMargins, ...]  # margins at each input, n_s
+    distance: float  # smallest singular value of I + L over all frequencies, at most 1 of use
 
     @property
     def together(self) -> tuple[float, float, float]:
-        """Gains [low, high] and phase [deg] that all inputs bear at once."""
+        """Gains [low, high] and phase [deg] that all inputs withstand at once."""
         a = min(self.distance, 1.0)
         return 1 / (1 + a), 1 / (1 - a) if a < 1 else np.inf, float(np.degrees(2 * np.arcsin(a / 2)))
 

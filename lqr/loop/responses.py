@@ -26,9 +26,9 @@ TOGETHER = 32  # states behind one product with the functionals
 class Responses:
     """f_n = W'x_n = free_n + sum_{k < n} kernel_{n-k} u_k of E x' = A x + B u, by the midpoint rule."""
 
-    dt: float  # step [s]
-    kernel: Array  # W'x at the grid points after u_0 = e_j, at rest before, (steps + 1, f, n_s)
-    free: Array  # W'x from the start without input, (steps + 1, f)
+    dt: float  # time step [s]
+    kernel: Array  # W'x at the grid points under u_0 = e_j from rest, (steps + 1, f, n_s)
+    free: Array  # W'x at the grid points from the start without input, (steps + 1, f)
 
     @property
     def steps(self) -> int:

@@ -68,10 +68,10 @@ class SmallPlant:
 
 @dataclass(frozen=True)
 class Shapes:
-    """z ~ V eta with V of a few columns, and the filter eta = W' z that takes z to them."""
+    """Reduced displacement z ~ V eta of k columns, and the filter eta = W' z."""
 
-    V: Array  # local rows (n_local, k)
-    W: Array  # M_ee V (V' M_ee V)^{-1}, local rows (n_local, k), so that W'V = I
+    V: Array  # displacement basis, local rows (n_local, k)
+    W: Array  # filter M_ee V (V' M_ee V)^{-1} with W'V = I, local rows (n_local, k)
 
     def reduce(self, problem: RiccatiProblem, x: PlantState) -> Array:
         """[q_s, v_s, W'z, W'v_z], (2 n_s + 2 k,), on every rank. Collective."""
@@ -134,16 +134,16 @@ def m_orthonormal(M: PETSc.Mat, V: Array, tolerance: float = 1e-10) -> Array:
 
 @dataclass(frozen=True)
 class ReducedLoopTrajectory:
-    """What a reduced run returns."""
+    """Result of a reduced run."""
 
-    times: Array  # grid [s], (steps + 1,)
-    states: Array  # (steps + 1, N)
-    q_s: Array  # hand, (steps + 1, n_s)
-    inputs: Array  # u of each step [N, N m], (steps, n_s)
-    outputs: Array  # (steps + 1, p)
-    cost: Array  # J up to each grid point, (steps + 1,)
-    saturated: float  # share of the steps in which an input sat at its limit
-    seconds: dict[str, float] = field(default_factory=dict)  # prepare, steps
+    times: Array  # time grid [s], (steps + 1,)
+    states: Array  # reduced states, (steps + 1, N)
+    q_s: Array  # displacement of the hand [m, rad], (steps + 1, n_s)
+    inputs: Array  # input u of each step [N, N m], (steps, n_s)
+    outputs: Array  # outputs y [m, rad], (steps + 1, p)
+    cost: Array  # cost J up to each grid point, (steps + 1,)
+    saturated: float  # share of the steps with an input at its limit
+    seconds: dict[str, float] = field(default_factory=dict)  # time of "prepare" and "steps" [s]
 
 
 class ReducedLoop:

@@ -10,7 +10,7 @@ import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, Complex, on_root
-from softgrasp.lqr.lowrank.adjoint import Right, Solution, closed_adjoint, mass_right
+from softgrasp.lqr.lowrank.adjoint import AdjointRhs, AdjointSolution, closed_adjoint, mass_rhs
 from softgrasp.lqr.lowrank.compress import compress, gram
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
@@ -23,7 +23,7 @@ GROWTH = 1e6  # of the residual against its start: the closed loop of the given 
 
 
 class FactorColumns:
-    """Z as it grows, in costate form; compressed when it gets wide.
+    """Growing factor Z in costate form, compressed when it gets wide.
 
     Args:
         allowed: what a compression on the way may change in the Riccati residual.
@@ -86,22 +86,23 @@ class FactorColumns:
 class LowRankSweep:
     """State of a sweep of solves, of ADI or RADI."""
 
-    state: Right  # [K', W, ...] with the gain K' and the residual factor W
-    Z: FactorColumns  # factor of X
-    steps: int = 0  # solves so far
+    state: AdjointRhs  # [K', W, ...] with the gain K' and the residual factor W
+    Z: FactorColumns  # factor of X ~ Z Z'
+    steps: int = 0  # number of solves so far
+    # time by stage [s]
     seconds: dict[str, float] = field(default_factory=lambda: {"shifts": 0.0, "small": 0.0, "products": 0.0})
 
     @property
-    def W(self) -> Right:
+    def W(self) -> AdjointRhs:
         """Residual factor (views)."""
         return self.state[self.Z.plant.inputs :]
 
     @property
-    def gain(self) -> Right:
+    def gain(self) -> AdjointRhs:
         """K' (views)."""
         return self.state[: self.Z.plant.inputs]
 
-    def solve(self, tissue: ShiftedTissue, queue: ShiftQueue) -> tuple[complex, Solution]:
+    def solve(self, tissue: ShiftedTissue, queue: ShiftQueue) -> tuple[complex, AdjointSolution]:
         """The next shift p and V of (A - B K + p E)'V = W. Collective."""
         begin, plant, m = time.perf_counter(), self.Z.plant, self.Z.plant.inputs
         if queue.short(self.steps):
@@ -116,20 +117,20 @@ class LowRankSweep:
 class AdiSweep(LowRankSweep):
     """[K', W, dK'] of A_c'XE + E'XA_c = -W_0 W_0', A_c = A - B K, with dK = B'XE - K of the X so far."""
 
-    first: float = 0.0  # ||W_0 W_0'||
+    first: float = 0.0  # residual ||W_0 W_0'||_2 at the start
 
     @property
-    def W(self) -> Right:
+    def W(self) -> AdjointRhs:
         """Residual factor, W W' the Lyapunov residual (views)."""
         return self.state[self.Z.plant.inputs : -self.Z.plant.inputs]
 
     @property
-    def change(self) -> Right:
+    def change(self) -> AdjointRhs:
         """Change of the gain, dK' (views)."""
         return self.state[-self.Z.plant.inputs :]
 
     @property
-    def new(self) -> Right:
+    def new(self) -> AdjointRhs:
         """(B'XE)' of the X so far."""
         return self.gain.plus(self.change, np.eye(self.Z.plant.inputs))
 
@@ -157,7 +158,7 @@ def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: AdiSweep, queue: ShiftQ
     small = np.zeros((Z.columns, q + 2 * m))
     np.fill_diagonal(small[:q, m : m + q], g)
     small[:, m + q :] = plant.inputs_of(Z)
-    sweep.state = sweep.state.plus(mass_right(plant, Z), small)
+    sweep.state = sweep.state.plus(mass_rhs(plant, Z), small)
     sweep.Z.append(Z)
     sweep.seconds["products"] += time.perf_counter() - begin
     return p

@@ -15,8 +15,8 @@ from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.plant.block import Block
 
 
-class Right(Block):
-    """A right-hand side W with a third part in ``tall``: rows z, v_z, those of a = K_ee^{-1} W_z, (3 n_local, k)."""
+class AdjointRhs(Block):
+    """Right-hand side W; ``tall`` has the rows z, v_z and those of a = K_ee^{-1} W_z, (3 n_local, k)."""
 
     @property
     def block(self) -> Block:
@@ -28,20 +28,20 @@ class Right(Block):
         """Rows q_s, v_s, z and v_z of W (views)."""
         return self.block.parts
 
-    def plus(self, E_V: Right, small: Array) -> Right:
+    def plus(self, E_V: AdjointRhs, small: Array) -> AdjointRhs:
         """W + E'V small."""
-        return Right(self.hand + E_V.hand @ small, self.tall + E_V.tall @ small)
+        return AdjointRhs(self.hand + E_V.hand @ small, self.tall + E_V.tall @ small)
 
 
 @dataclass(frozen=True)
-class Solution:
+class AdjointSolution:
     """V = [a_s; b_s; a; b] = (solutions of the open loop for K' and W) mix, a = (a_0 + b) / p."""
 
-    p: complex
-    hand: Complex  # open loop, a_s and b_s, (2 n_s, k)
-    b: Complex  # open loop, local rows (n_local, k), rows side by side in memory
-    a: Array  # a_0 = K_ee^{-1} of the z-rows, local rows (n_local, k)
-    mix: Complex  # (k, q), of the Sherman-Morrison-Woodbury formula
+    p: complex  # shift [1/s]
+    hand: Complex  # a_s and b_s of the open loop, (2 n_s, k)
+    b: Complex  # velocity part b of the open loop, local rows (n_local, k), C-contiguous
+    a: Array  # a_0 = K_ee^{-1} W_z, local rows (n_local, k)
+    mix: Complex  # coefficients of the Sherman-Morrison-Woodbury formula, (k, q)
 
     def real(self, coefficients: Complex) -> Block:
         """Re(V c) for a (q, l) matrix c, without V: one real product each for a and b."""
@@ -83,23 +83,23 @@ def _solve_small(A: Complex, B: Complex) -> Complex:
     return np.asarray(X)
 
 
-def make_right(plant: Plant, tissue: ShiftedTissue, block: Block) -> Right:
+def adjoint_rhs(plant: Plant, tissue: ShiftedTissue, block: Block) -> AdjointRhs:
     """Add a = K_ee^{-1} W_z: one factorisation and solve. Collective."""
     a = tissue.solve(0.0, block.tall[: plant.n_local])
-    return Right(block.hand, np.vstack([block.tall, a.real]))
+    return AdjointRhs(block.hand, np.vstack([block.tall, a.real]))
 
 
-def mass_right(plant: Plant, V: Block) -> Right:
+def mass_rhs(plant: Plant, V: Block) -> AdjointRhs:
     """E'V of real columns in costate form; its a is the displacement part of V. Collective."""
     n = plant.n_local
     rows = np.empty((3 * n, V.columns))
     E_V = plant.mass_adjoint(V, rows[: 2 * n])
     rows[2 * n :] = V.tall[:n]
-    return Right(E_V.hand, rows)
+    return AdjointRhs(E_V.hand, rows)
 
 
 def open_adjoint(
-    plant: Plant, tissue: ShiftedTissue, p: complex, W: Right, ahead: Sequence[complex] = ()
+    plant: Plant, tissue: ShiftedTissue, p: complex, W: AdjointRhs, ahead: Sequence[complex] = ()
 ) -> tuple[Complex, Complex]:
     """Solve (A + p E)'V = W; returns a_s and b_s (2 n_s, k), and b (n_local, k).
 
@@ -131,8 +131,8 @@ def open_adjoint(
 
 
 def closed_adjoint(
-    plant: Plant, tissue: ShiftedTissue, p: complex, right: Right, ahead: Sequence[complex] = ()
-) -> Solution:
+    plant: Plant, tissue: ShiftedTissue, p: complex, right: AdjointRhs, ahead: Sequence[complex] = ()
+) -> AdjointSolution:
     """Solve (A - B K + p E)'V = W by the Sherman-Morrison-Woodbury formula.
 
     [N, L] = (A + pE)^{-T} [K', W],  V = L + N (I - B'N)^{-1} B'L. Collective.
@@ -144,4 +144,4 @@ def closed_adjoint(
     m = plant.inputs
     small = _solve_small(np.eye(m, dtype=complex) - B_V[:, :m], B_V[:, m:])
     mix = np.vstack([small, np.eye(right.columns - m)])
-    return Solution(complex(p), hand, b, right.tall[2 * plant.n_local :], mix)
+    return AdjointSolution(complex(p), hand, b, right.tall[2 * plant.n_local :], mix)

@@ -26,9 +26,9 @@ BUDGET = 0.45  # share of omega at which a response's damping ratio is held belo
 class Space:
     """A displacement basis with its products, grown by blocks of columns."""
 
-    V: Array  # local rows (n_local, r)
-    M_V: Array
-    K_V: Array
+    V: Array  # basis, local rows (n_local, r)
+    M_V: Array  # M_ee V, local rows (n_local, r)
+    K_V: Array  # K_ee V, local rows (n_local, r)
 
     def grown(self, plant: Plant, columns: Array) -> Space:
         """With the parts of more columns that are new: M-orthogonal to V, which is M-orthonormal. Collective."""
@@ -64,12 +64,12 @@ class Space:
 class Level:
     """One Galerkin space with its solution."""
 
-    omega: Array  # frequencies of the basis, (r,)
-    X: Array  # of the projected plant
-    Z: Block  # X ~ Z Z', costate form
-    a: Array  # tissue part of the gain in costate form, K_z' = K_ee a, local rows (n_local, m)
-    b: Array  # and K_v' = M_ee b
-    gain: Block  # K', z-row as it stands
+    omega: Array  # frequencies of the basis [1/s], (r,)
+    X: Array  # Riccati solution of the projected plant, (2 n_s + 2 r, 2 n_s + 2 r)
+    Z: Block  # factor X ~ Z Z' in costate form, hand (2 n_s, rank), local rows (2 n_local, rank)
+    a: Array  # displacement part of the gain, K_z' = K_ee a, local rows (n_local, m)
+    b: Array  # velocity part of the gain, K_v' = M_ee b, local rows (n_local, m)
+    gain: Block  # K' with unscaled z-row, hand (2 n_s, m), local rows (2 n_local, m)
 
 
 def _root(X: Array) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array, PETSc, on_root, total
-from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.fem.solve.modes import KEPT_ENTRIES, lowest_modes
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.dense.care import FAST_RESIDUAL, StateSpace, fast_solution, lyapunov, riccati_residual, solve_reduced
 from softgrasp.lqr.dense.modal import TissueMatrices, assemble_space, in_energy
@@ -28,12 +28,12 @@ CORRECTIONS = 4  # Newton steps from the solution on a smaller space; more cost 
 class ModalStart:
     """Gain and shifts of the modal problem."""
 
-    gain: Block  # K', local rows, z-row as it stands
-    poles: np.ndarray  # closed-loop poles, most important first, one of each pair, Im >= 0
+    gain: Block  # K' with unscaled z-row, hand (2 n_s, m), local rows (2 n_local, m)
+    poles: np.ndarray  # closed-loop poles [1/s], most important first, one of each pair, Im >= 0, (k,)
 
 
-class _MovedMass:
-    """M_ee - G M_s^{-1} G': inertia of the tissue when the hand gives way (two-way coupling)."""
+class _SchurMass:
+    """M_ee - G M_s^{-1} G': mass of the tissue with the free hand eliminated (two-way coupling)."""
 
     def __init__(self, system: BlockSystem, M_s: Array) -> None:
         self.M, self.G, self.comm = system.M_ee, system.G, system.layout.comm
@@ -53,8 +53,20 @@ def plant_modes(plant: Plant, k: int) -> tuple[Array, Array]:
         return np.zeros(0), np.zeros((plant.n_local, 0))
     if not plant.two_way:
         return lowest_modes(system, k)
-    sizes = system.M_ee.getSizes()
-    shell = PETSc.Mat().createPython(sizes, _MovedMass(system, plant.M_s), comm=system.layout.comm)
+    key = (system.K_ee.handle, system.K_ee.stateGet(), system.M_ee.handle, system.M_ee.stateGet(), plant.M_s.tobytes())
+    kept = system.kept.get("floating modes")
+    if kept is None or kept[0] != key or len(kept[1]) < k:
+        most = max(k, min(MORE_MODES, system.layout.n_e))  # the certificate asks for them after the start of a solver
+        kept = key, *_floating(plant, most), system.K_ee, system.M_ee  # no other matrix can take their handles
+        if most * system.layout.n_e <= KEPT_ENTRIES:
+            system.kept["floating modes"] = kept
+    return kept[1][:k].copy(), kept[2][:, :k].copy(order="F")
+
+
+def _floating(plant: Plant, k: int) -> tuple[Array, Array]:
+    """Modes of K_ee and M_ee - G M_s^{-1} G', computed. Collective."""
+    system = plant.system
+    shell = PETSc.Mat().createPython(system.M_ee.getSizes(), _SchurMass(system, plant.M_s), comm=system.layout.comm)
     shell.setUp()
     try:
         return lowest_modes(replace(system, M_ee=shell), k)

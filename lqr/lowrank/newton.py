@@ -13,10 +13,10 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.checksums import digest, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
-from softgrasp.fem.errors import CheckpointError, SolverError, agree
+from softgrasp.fem.errors import CheckpointError, SolverError, raise_on_all_ranks
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.lowrank.adi import SHARE, AdiSweep, FactorColumns, adi_step, sweep_norms
-from softgrasp.lqr.lowrank.adjoint import Right, make_right
+from softgrasp.lqr.lowrank.adjoint import AdjointRhs, adjoint_rhs
 from softgrasp.lqr.lowrank.compress import triangular
 from softgrasp.lqr.lowrank.modal_start import ModalStart, modal_start
 from softgrasp.lqr.lowrank.plant import Plant
@@ -33,15 +33,15 @@ SHORTEST = 1e-2  # step length
 
 @dataclass
 class Iteration:
-    """What Newton's method carries from step to step."""
+    """State of Newton's method between two steps."""
 
-    gain: Right  # K_j'
-    step: int = 0  # Newton steps done
-    solves: int = 0  # tissue solves done
-    factor: tuple[Block, Array] | None = None  # (U, signs) with R_j = U diag(signs) U', unknown before the first step
+    gain: AdjointRhs  # gain K_j', m columns
+    step: int = 0  # number of finished Newton steps
+    solves: int = 0  # number of tissue solves
+    factor: tuple[Block, Array] | None = None  # (U, signs) with R_j = U diag(signs) U'; None before the first step
     achieved: float = np.inf  # relative Riccati residual of the last finished step
-    history: list[dict[str, float]] = field(default_factory=list)  # one dictionary a solve
-    seconds: dict[str, float] = field(default_factory=dict)  # time by stage
+    history: list[dict[str, float]] = field(default_factory=list)  # one dictionary per solve
+    seconds: dict[str, float] = field(default_factory=dict)  # time by stage [s]
 
 
 def fingerprint(plant: Plant) -> str:
@@ -79,13 +79,13 @@ def save_state(folder: Path, plant: Plant, state: Iteration, sweep: AdiSweep) ->
         entries |= {"factor_hand": U.hand, "factor_tall": U.tall, "factor_signs": signs}
     comm = plant.comm
     name, sha256 = f"newton-solve{state.solves}-rank{comm.rank}.npz", ""
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         try:
             sha256 = write_arrays(folder / name, entries)
         except OSError as error:
             raise CheckpointError(f"{folder}: the restart file cannot be written ({error}); free the disk") from error
     files = comm.gather((name, sha256))
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         if files is not None:
             try:
                 write_manifest(_manifest(folder), {"format": FORMAT, "ranks": comm.size, "files": files})
@@ -104,7 +104,7 @@ def load_state(folder: Path, plant: Plant, state: Iteration, tol: float) -> AdiS
         return None
     sweep: AdiSweep | None = None
     advice = f"remove the folder {folder}"
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         entry = read_manifest(manifest, FORMAT, advice)
         foreign = f"{manifest} belongs to another control problem or rank count; {advice} or name another one"
         if entry["ranks"] != comm.size:
@@ -129,7 +129,7 @@ def _restore(plant: Plant, state: Iteration, data: dict[str, Array], tol: float)
     Z.count, Z.compressed_to = Z.hand.shape[1], int(data["compressed_to"])
     Z.appended = int(data["appended"])
     Z.widths = [int(width) for width in data["widths"]]
-    sweep = AdiSweep(Right(data["sweep_hand"], data["sweep_rows"]), Z, steps, first=first)
+    sweep = AdiSweep(AdjointRhs(data["sweep_hand"], data["sweep_rows"]), Z, steps, first=first)
     state.gain = sweep.gain
     return sweep
 
@@ -149,8 +149,8 @@ class NewtonADI(LowRankSolver[ModalStart]):
     method = "newton_adi"
     max_iterations: int = 15  # bound on the Newton steps
     max_solves: int = 1000  # bound on the solves of one sweep
-    modes: int | None = None  # modes of the start; 0 starts from the hand alone, None chooses
-    checkpoint: Path | None = None  # folder for restart files, one a rank; an existing one is resumed
+    modes: int | None = None  # number of modes of the start; 0: the hand alone, None: by the damping
+    checkpoint: Path | None = None  # folder for restart files, one per rank; an existing one is resumed
     checkpoint_every: int = 25  # solves between two restart files
 
     def prepare(self, plant: Plant) -> ModalStart:
@@ -159,7 +159,7 @@ class NewtonADI(LowRankSolver[ModalStart]):
 
     def iterate(self, plant: Plant, tissue: ShiftedTissue, start: ModalStart) -> Iterate:
         """Newton steps until the Riccati residual is small. Collective."""
-        right = make_right(plant, tissue, Block.join([plant.outputs(), start.gain]))
+        right = adjoint_rhs(plant, tissue, Block.join([plant.outputs(), start.gain]))
         p = plant.C_s.shape[0]
         outputs, state = right[:p], Iteration(right[p:])
         first = ShiftQueue.start(shift_range(plant, start.poles), start.poles)
@@ -168,7 +168,7 @@ class NewtonADI(LowRankSolver[ModalStart]):
         while True:
             if sweep is None:
                 K = state.gain
-                W = Right.join([K, outputs, K, Right(-K.hand, -K.tall)])  # [K', W_0, dK'], W_0 = [C', K']
+                W = AdjointRhs.join([K, outputs, K, AdjointRhs(-K.hand, -K.tall)])  # [K', W_0, dK'], W_0 = [C', K']
                 sweep = AdiSweep(W, FactorColumns(plant, SHARE * self.tol * plant.scale))
             queue = replace(first, pending=shifts[sweep.steps :])  # a resumed sweep has used some
             quadratic = min(0.1 * state.achieved, 0.9 * state.achieved**2) if np.isfinite(state.achieved) else 0.0
@@ -220,7 +220,7 @@ def _advance(plant: Plant, sweep: AdiSweep, state: Iteration) -> None:
         best, before, after = best_step(plant.comm, state.factor, sweep.W.block, change)
         if after > LINE_SEARCH * before:
             t = best
-            state.achieved = np.inf  # of the full step, which is not taken
+            state.achieved = np.inf  # it was that of the full step, which is rejected
     state.history[-1]["step_length"] = t
     state.factor = mixed_residual(state.factor, sweep.W.block, change, t)
     state.gain = sweep.gain.plus(sweep.change, t * np.eye(plant.inputs))

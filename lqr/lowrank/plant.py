@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from softgrasp.fem.errors import agree
+from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError, check_finite, check_weights, square_root
@@ -34,7 +34,7 @@ class Plant:
         system = problem.system
         self.problem, self.system, self.layout, self.comm = problem, system, system.layout, system.layout.comm
         self.n_s, self.n_local = self.layout.n_s, self.layout.n_local
-        with agree(self.comm):
+        with raise_on_all_ranks(self.comm):
             check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
             check_finite(C_s=problem.C_s, C_z=problem.C_z, G=system.G, M_hand=system.M_hand, B_z=problem.B_z)
             check_finite(K_ee=system.K_ee, M_ee=system.M_ee)

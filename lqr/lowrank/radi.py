@@ -11,7 +11,7 @@ import numpy as np
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.lowrank.adi import GROWTH, SHARE, FactorColumns, LowRankSweep
-from softgrasp.lqr.lowrank.adjoint import Right, Solution, make_right, mass_right
+from softgrasp.lqr.lowrank.adjoint import AdjointRhs, AdjointSolution, adjoint_rhs, mass_rhs
 from softgrasp.lqr.lowrank.compress import gram
 from softgrasp.lqr.lowrank.modal_start import ModalStart, modal_start
 from softgrasp.lqr.lowrank.plant import Plant
@@ -22,7 +22,7 @@ from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import MODAL_KEY
 
 
-def radi_columns(plant: Plant, s: complex, V: Solution) -> tuple[Block, Array, Array, float]:
+def radi_columns(plant: Plant, s: complex, V: AdjointSolution) -> tuple[Block, Array, Array, float]:
     """Real columns V_1 of the update X += V_1 Y^{-1} V_1', with Y, V_1'B and the factor of W [BBKS18].
 
     s real: V_1 = sqrt(-2s) V, Y = I - V_1'B B'V_1 / (2s). s complex: V_1 = sqrt(-2 Re s) [Re V, Im V] and the Y of the
@@ -59,7 +59,7 @@ def radi_step(plant: Plant, tissue: ShiftedTissue, sweep: LowRankSweep, queue: S
     except np.linalg.LinAlgError as error:
         raise SolverError(f"radi: the step at the shift {s:.4g} is not definite; use newton_adi") from error
     weight = inverse.T @ inverse
-    sweep.state = sweep.state.plus(mass_right(plant, columns), np.hstack([weight @ V_B, c * weight[:, :q]]))
+    sweep.state = sweep.state.plus(mass_rhs(plant, columns), np.hstack([weight @ V_B, c * weight[:, :q]]))
     sweep.Z.append(columns.times(inverse.T))
     sweep.seconds["products"] += time.perf_counter() - begin
     return s
@@ -83,9 +83,9 @@ class RADI(LowRankSolver[ModalStart]):
 
     def iterate(self, plant: Plant, tissue: ShiftedTissue, start: ModalStart) -> Iterate:
         """Steps until the residual is small. Collective."""
-        W = make_right(plant, tissue, plant.outputs())
-        gain = Right(np.zeros((len(W.hand), plant.inputs)), np.zeros((len(W.tall), plant.inputs)))
-        sweep = LowRankSweep(Right.join([gain, W]), FactorColumns(plant, SHARE * self.tol * plant.scale))
+        W = adjoint_rhs(plant, tissue, plant.outputs())
+        gain = AdjointRhs(np.zeros((len(W.hand), plant.inputs)), np.zeros((len(W.tall), plant.inputs)))
+        sweep = LowRankSweep(AdjointRhs.join([gain, W]), FactorColumns(plant, SHARE * self.tol * plant.scale))
         queue = ShiftQueue.start(shift_range(plant, start.poles), start.poles)
         relative, history = 1.0, list[dict[str, float]]()
         while sweep.steps < self.max_iterations and relative <= GROWTH:

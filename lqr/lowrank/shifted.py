@@ -15,7 +15,7 @@ import scipy.sparse.linalg
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from softgrasp.fem.errors import ResourceError, SolverError, agree
+from softgrasp.fem.errors import ResourceError, SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, Complex, PETSc, petsc_options, whole_copy
 from softgrasp.fem.resources import free_memory
@@ -209,7 +209,7 @@ class GatheredTissue(ShiftedTissue):
             self.cache = {}
             fresh: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]]
             fresh = {p: (rank, None) for rank, p in enumerate(shifts)}
-            with agree(self.comm):
+            with raise_on_all_ranks(self.comm):
                 if self.comm.rank < len(shifts):
                     p = shifts[self.comm.rank]
                     fresh[p] = (self.comm.rank, self._make(p))
@@ -298,7 +298,7 @@ class DistributedTissue(ShiftedTissue):
 
     def _values(self, A: PETSc.Mat) -> Array:
         indptr, columns, values = A.getValuesCSR()
-        with agree(self.comm):
+        with raise_on_all_ranks(self.comm):
             if not (np.array_equal(indptr, self.indptr) and np.array_equal(columns, self.columns)):
                 raise SolverError("mass, stiffness and damping have different sparsity patterns; assemble them on one")
         return np.asarray(values)

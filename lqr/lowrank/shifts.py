@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.fem.system import BlockSystem
-from softgrasp.lqr.lowrank.adjoint import Right
+from softgrasp.lqr.lowrank.adjoint import AdjointRhs
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
 
@@ -29,8 +29,8 @@ AXIS = 1e-9  # a shift keeps at least this share of its modulus away from the im
 class ShiftRange:
     """Moduli that a shift may have [1/s]."""
 
-    low: float
-    high: float
+    low: float  # smallest modulus [1/s]
+    high: float  # largest modulus [1/s]
 
     def clip(self, values: np.ndarray) -> np.ndarray:
         """Nearest admissible shifts in the left half plane, Im >= 0, (k,)."""
@@ -60,7 +60,7 @@ def shift_range(plant: Plant, poles: np.ndarray) -> ShiftRange:
     return ShiftRange(LOWEST * slowest, HIGHEST * max(largest, plant.system.damping.beta * largest**2))
 
 
-def ritz_pairs(plant: Plant, V: Block, W: Block, gain: Right | None) -> tuple[np.ndarray, Array]:
+def ritz_pairs(plant: Plant, V: Block, W: Block, gain: AdjointRhs | None) -> tuple[np.ndarray, Array]:
     """Ritz values of (A - B K)' on span E'V in the energy inner product, and how much of the residual lies on each.
 
     H^{-1}, H = blkdiag(1, M_s, K_ee, M_ee): without feedback the plant is dissipative in this product, so no Ritz value
@@ -156,8 +156,8 @@ def choose_shifts(candidates: np.ndarray, weights: Array, count: int, planned: S
 class ShiftQueue:
     """The next shifts of one sweep."""
 
-    limits: ShiftRange  # admissible range
-    pending: list[complex] = field(default_factory=list)  # shifts to come
+    limits: ShiftRange  # admissible moduli
+    pending: list[complex] = field(default_factory=list)  # shifts not used yet, next one first [1/s]
 
     @classmethod
     def start(cls, limits: ShiftRange, poles: Sequence[complex] | np.ndarray) -> ShiftQueue:
@@ -173,7 +173,7 @@ class ShiftQueue:
         """Whether more shifts are due after so many steps."""
         return not self.pending or (steps > 0 and len(self.pending) <= EARLY)
 
-    def refill(self, plant: Plant, recent: Block, W: Block, gain: Right | None) -> None:
+    def refill(self, plant: Plant, recent: Block, W: Block, gain: AdjointRhs | None) -> None:
         """Ritz values of the recent blocks, clipped and chosen. Collective."""
         values, sizes = ritz_pairs(plant, recent, W, gain)
         upper = values.imag >= 0

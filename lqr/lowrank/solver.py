@@ -1,4 +1,4 @@
-"""What the low-rank solvers share: plant, start and tissue solves, and the way from their columns to the solution."""
+"""Base of the low-rank solvers: plant, start and tissue solves, and the solution from the columns of its factor."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ SLACK = 2.0
 
 @dataclass
 class Iterate:
-    """What the recursion of a solver ends with."""
+    """Result of the iteration."""
 
-    Z: Block  # columns in costate form
-    gain: Block  # K' = (B'XE)', z-row as it stands
-    about: str  # what it did, in words
-    history: list[dict[str, float]]
-    counts: dict[str, int]  # solves among them
-    seconds: dict[str, float] = field(default_factory=dict)
+    Z: Block  # factor X ~ Z Z' in costate form, hand (2 n_s, rank), local rows (2 n_local, rank)
+    gain: Block  # K' = (B'XE)' with unscaled z-row, hand (2 n_s, m), local rows (2 n_local, m)
+    about: str  # method, order and kind of tissue solver, in words
+    history: list[dict[str, float]]  # one dictionary per iteration
+    counts: dict[str, int]  # number of tissue solves ("solves") and of iterations by name
+    seconds: dict[str, float] = field(default_factory=dict)  # time by stage [s]
 
 
 @dataclass(frozen=True, kw_only=True)
 class LowRankSolver[Start](ABC):
     """Solve A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = 0 for X = Z Z'."""
 
-    method: ClassVar[SolverName]
-    by_residual: ClassVar[bool] = True  # Z is compressed, and accepted by its true residual
+    method: ClassVar[SolverName]  # name of the solver in scenes and results
+    by_residual: ClassVar[bool] = True  # whether Z is compressed and accepted by its true residual
     tol: float = 1e-10  # bound on the true relative residual, 2-norm, hand-relative coordinates
     tissue: str = "auto"  # gathered, distributed or auto, see softgrasp.lqr.lowrank.shifted
     progress: Progress | None = None  # called on every rank with every history entry
@@ -92,14 +92,14 @@ class LowRankSolver[Start](ABC):
 
     @abstractmethod
     def prepare(self, plant: Plant) -> Start:
-        """What precedes the tissue solves. Collective."""
+        """Preparation before the tissue solves. Collective."""
 
     @abstractmethod
     def iterate(self, plant: Plant, tissue: ShiftedTissue, start: Start) -> Iterate:
-        """The recursion, to the tolerance. Collective."""
+        """The iteration, to the tolerance. Collective."""
 
     def record(self, history: list[dict[str, float]], entry: dict[str, float]) -> None:
-        """Keep an entry and tell the observer."""
+        """Append an entry to the history and report it to the observer."""
         history.append(entry)
         if self.progress is not None:
             self.progress(entry)

@@ -14,8 +14,8 @@ from softgrasp.fem.petsc import Array
 class Block:
     """A few columns of the size of the state."""
 
-    hand: Array  # rows of q_s and v_s, (2 n_s, k), on every rank
-    tall: Array  # local rows of z and v_z, one below the other, (2 n_local, k)
+    hand: Array  # rows q_s and v_s on every rank, (2 n_s, k)
+    tall: Array  # local rows z, then v_z, (2 n_local, k)
 
     @property
     def columns(self) -> int:

@@ -15,10 +15,10 @@ from softgrasp.lqr.plant.block import Block
 class PlantState:
     """x = [q_s, v_s, z, v_z] with z = q_e - T q_s."""
 
-    q_s: Array  # hand [m, rad], (n_s,), on every rank
-    v_s: Array  # its velocity [m/s, rad/s], (n_s,)
+    q_s: Array  # displacement of the hand on every rank [m, rad], (n_s,)
+    v_s: Array  # velocity of the hand on every rank [m/s, rad/s], (n_s,)
     z: Array  # displacement of the tissue relative to the hand [m], local rows (n_local,)
-    v_z: Array  # its velocity [m/s], (n_local,)
+    v_z: Array  # velocity of the tissue relative to the hand [m/s], local rows (n_local,)
 
     def __sub__(self, other: PlantState) -> PlantState:
         return PlantState(self.q_s - other.q_s, self.v_s - other.v_s, self.z - other.z, self.v_z - other.v_z)
@@ -33,9 +33,9 @@ class PlantState:
 class Gain:
     """u = K x = K_s [q_s; v_s] + K_z' z + K_v' v_z."""
 
-    K_s: Array  # gain on the hand [N/m, N s/m; N m for torques], (n_s, 2 n_s), on every rank
-    K_z: Array  # gain on z, transposed, local rows (n_local, n_s)
-    K_v: Array  # gain on v_z
+    K_s: Array  # gain on the hand, on every rank [N/m, N s/m; N m for torques], (n_s, 2 n_s)
+    K_z: Array  # gain on z, transposed [N/m], local rows (n_local, n_s)
+    K_v: Array  # gain on v_z, transposed [N s/m], local rows (n_local, n_s)
 
     @property
     def block(self) -> Block:

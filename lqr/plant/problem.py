@@ -1,4 +1,4 @@
-"""The linear-quadratic problem of a hand that carries tissue, hand-relative, its solution, and what holds exactly."""
+"""The linear-quadratic problem of a hand that carries tissue, hand-relative, its solution, and its exact identities."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class RiccatiProblem:
     :func:`softgrasp.lqr.plant.second_order.second_order`.
     """
 
-    system: BlockSystem  # the operators; never a dense n x n array
-    C_s: Array  # outputs of the hand's displacement, (p, n_s), on every rank
+    system: BlockSystem  # sparse operators of hand and tissue
+    C_s: Array  # outputs of the hand's displacement, on every rank, (p, n_s)
     C_z: Array  # outputs of the relative displacement, transposed, local rows (n_local, p)
-    Q: Array  # (p, p), symmetric positive semidefinite [1/(m2 s)]
-    R: Array  # (m, m), symmetric positive definite [1/(N2 s)], m = n_s
-    columns: Columns = ()  # one per output component, or none
+    Q: Array  # weight of the outputs, symmetric positive semidefinite [1/(m2 s)], (p, p)
+    R: Array  # weight of the inputs, symmetric positive definite [1/(N2 s)], (m, m), m = n_s
+    columns: Columns = ()  # label and unit of each output, p or none
     # forces of the inputs on the tissue, local rows (n_local, m), when there is no hand; else None
     B_z: Array | None = None
 
@@ -65,15 +65,24 @@ class RiccatiProblem:
 class RiccatiSolution:
     """X ~ Z Z' and the feedback u = K x, in the hand-relative coordinates of :class:`RiccatiProblem`."""
 
-    factor: Block  # Z, hand rows [q_s, v_s] and local tissue rows [z; v_z], ``rank`` columns
-    gain: Gain  # K = -R^{-1} B'XE
-    residual: float  # true relative residual ||Res||_2 / ||C'QC||_2, recomputed from Z at the end
-    method: SolverName  # the solver
-    about: str = ""  # what the solver did, in words
-    reason: str = ""  # why this solver was chosen; empty when the caller made it
-    history: tuple[dict[str, float], ...] = ()  # one dictionary per iteration
-    counts: dict[str, int] = field(default_factory=dict)  # newton_steps, adi_steps, solves
-    seconds: dict[str, float] = field(default_factory=dict)  # time by stage
+    factor: Block
+    """Factor Z, hand (2 n_s, rank), local rows (2 n_local, rank)."""
+    gain: Gain
+    """Optimal gain K = -R^{-1} B'XE."""
+    residual: float
+    """True relative residual ||Res||_2 / ||C'QC||_2, recomputed from Z."""
+    method: SolverName
+    """Name of the solver."""
+    about: str = ""
+    """Order and steps of the solver, in words."""
+    reason: str = ""
+    """Why this solver was chosen; empty when the caller made it."""
+    history: tuple[dict[str, float], ...] = ()
+    """Residual or change of each iteration, one dictionary per iteration."""
+    counts: dict[str, int] = field(default_factory=dict)
+    """Numbers of "newton_steps", "adi_steps" and tissue "solves"."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Time by stage [s]."""
 
     @property
     def rank(self) -> int:

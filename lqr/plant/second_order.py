@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgrasp.fem.errors import SolverError, agree
+from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.system import BlockSystem, Damping
@@ -41,7 +41,7 @@ def second_order(
     comm = M.comm.tompi4py()
     first, last = M.getOwnershipRange()
     n, n_e = last - first, M.getSize()[0]
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         for name, A in (("M", M), ("D", D), ("K", K)):
             if A.getSize() != (n_e, n_e) or A.getOwnershipRange() != (first, last):
                 raise SolverError(f"{name} is {A.getSize()} with rows {A.getOwnershipRange()}; it must match M")

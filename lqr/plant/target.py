@@ -25,13 +25,13 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 class Target:
     """State, input and outputs at rest."""
 
-    state: PlantState  # x_bar
+    state: PlantState  # state x_bar at rest
     u: Array  # steady input u_bar [N, N m], (n_s,)
-    y: Array  # outputs there [m], (p,)
+    y: Array  # outputs at rest [m, rad], (p,)
 
 
 def steady_input(system: BlockSystem) -> Array:
-    """u_bar that holds hand (and, two-way, tissue) against gravity [N, N m], (n_s,)."""
+    """u_bar that balances the weight of the hand (and, two-way, of the tissue) [N, N m], (n_s,)."""
     u = np.zeros(system.layout.n_s)
     if system.gravity is None:
         return u

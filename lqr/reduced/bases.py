@@ -37,8 +37,8 @@ class RiccatiBasis:
     """
 
     name: str  # key of BASES
-    W: Block  # costate basis, N columns
-    U: Block  # state basis, N columns
+    W: Block  # costate basis, hand (2 n_s, N), local rows (2 n_local, N)
+    U: Block  # state basis, hand (2 n_s, N), local rows (2 n_local, N)
 
     @property
     def N(self) -> int:
@@ -57,11 +57,11 @@ class BasisFamily:
     """Nested bases of one method."""
 
     name: str  # key of BASES
-    smallest: int  # least order that exists
-    largest: int  # largest order that exists
-    step: int  # distance of orders that exist
-    sigma: tuple[Array, ...]  # singular values the truncation is chosen from, one array per POD
-    make: Callable[[int], RiccatiBasis]  # the basis of order N
+    smallest: int  # smallest order
+    largest: int  # largest order
+    step: int  # distance of neighbouring orders
+    sigma: tuple[Array, ...]  # singular values behind the truncation, one array per POD
+    make: Callable[[int], RiccatiBasis]  # function from the order N to its basis
 
     def orders(self, sizes: Sequence[int]) -> list[int]:
         """Those of the orders that exist."""

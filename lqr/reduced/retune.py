@@ -22,8 +22,8 @@ Materials = tuple[LayerMaterial, ...]
 class Tuned:
     """Gain for one setting of the materials."""
 
-    P_N: Array  # (N, N), in the retuner's scaled basis
-    K_N: Array  # gain on reduced states, u = K_N x_N, (n_s, N)
+    P_N: Array  # Riccati solution in the retuner's scaled basis, (N, N)
+    K_N: Array  # gain u = K_N x_N on reduced states, (n_s, N)
 
 
 class Retuner:
@@ -83,8 +83,8 @@ class Retuner:
 class RetunedGain(GainQuality):
     """The gain at one setting of the box, against the full Riccati solution there."""
 
-    materials: Materials  # of all layers
-    seconds: float = NAN  # of the re-tuning; nan unless the caller measures it
+    materials: Materials  # materials of all layers
+    seconds: float = NAN  # time of the re-tuning, nan unless the caller measures it [s]
 
 
 def retuned_gain(retuner: Retuner, materials: Materials, gain_check: Callable[[], GainCheck]) -> RetunedGain:

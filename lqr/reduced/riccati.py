@@ -39,10 +39,10 @@ NAN = float("nan")
 class ReducedRiccati:
     """P_hat = V P_N V' and its gain."""
 
-    basis: RiccatiBasis  # the basis, scaled to energy
+    basis: RiccatiBasis  # basis, scaled to energy
     matrices: StateSpace  # E_N, A_N, B_N, C_N with the weights
-    P_N: Array  # (N, N)
-    gain: Gain  # K_hat on the full plant
+    P_N: Array  # solution of the reduced equation, (N, N)
+    gain: Gain  # gain K_hat on the full plant
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,12 +54,12 @@ class GainQuality:
     cost_excess: float = NAN
     abscissa_full: float = NAN  # largest real part of the full closed loop [1/s]
     reason: str = ""  # why there is no gain; empty when there is one
-    certified: bool = True  # the sign of the abscissa is certain, see LoopQuality
-    examined: bool = True  # the full plant was asked for its spectrum; else the modes kept alone
-    sampled: SampledRadius | None = None  # the loop from tick to tick, where its instants are known
-    gain: Gain | None = None  # K_hat; None where there is none
-    cost_excess_at_most: float = NAN  # bound on the excess of the loop as it runs; nan where not asked for
-    cost_excess_proved: float = NAN  # the part that is proved, see softgrasp.lqr.design.orders.with_bounds
+    certified: bool = True  # whether the sign of the abscissa is certain, see LoopQuality
+    examined: bool = True  # whether the spectrum is that of the full plant; else of the modes kept
+    sampled: SampledRadius | None = None  # radius from tick to tick; None where the instants are unknown
+    gain: Gain | None = None  # gain K_hat; None where there is none
+    cost_excess_at_most: float = NAN  # bound on the excess cost of the loop as it runs; nan where not asked for
+    cost_excess_proved: float = NAN  # proved part of that bound, see softgrasp.lqr.design.orders.with_bounds
     bounded_to: float = NAN  # end of the run behind the two bounds [s]
 
     @property
@@ -100,8 +100,8 @@ class GainReport(GainQuality):
     method: str  # key of the basis
     N: int  # order of the reduced equation
     error_P: float = NAN  # noqa: N815  ||P - P_hat||_F / ||P||_F in the paper's coordinates
-    time_are: float = NAN  # seconds of one solution of the reduced equation, for who measures it
-    matrices: StateSpace | None = None  # of the reduced equation; None where they are not kept
+    time_are: float = NAN  # time of one solution of the reduced equation, nan unless the caller measures it [s]
+    matrices: StateSpace | None = None  # reduced equation; None where it is not kept
 
 
 def project_plant(problem: RiccatiProblem, basis: RiccatiBasis) -> StateSpace:

@@ -18,7 +18,7 @@ from softgrasp.lqr.plant.checks import EPS, ControlError
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import damp, descriptor
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.spectrum.tail import Tail, why_no_bound
+from softgrasp.lqr.spectrum.tail import TailBound, why_no_bound
 
 PREFIX = "softgrasp_spectrum_"
 TOLERANCE = 1e-9  # of 1/(sigma - lambda)
@@ -36,17 +36,22 @@ NEARLY = 1e-3  # share of the abscissa by which an eigenvalue outside may exceed
 class Abscissa:
     """Largest real part of the closed-loop spectrum."""
 
-    # over the eigenvalues found [1/s]: a lower bound of the abscissa, which exceeds it by at most a thousandth where
-    # ``exact``
     value: float
-    # the sign of ``value`` is that of the abscissa: it is >= 0, or no eigenvalue with Re s >= 0 lies outside the radius
+    """Largest real part of the computed eigenvalues, a lower bound of the abscissa [1/s]."""
     certified: bool
-    radius: float  # all eigenvalues with Re s >= 0 and |s| <= radius are among those found [1/s]
-    bound: float  # of |K (sE - A)^{-1} B| over Re s >= 0, |s| >= radius; below 1 it excludes eigenvalues there
-    eigenvalues: np.ndarray  # those found, nearest to ``shift`` first, (k,)
-    reason: str = ""  # why it is not certified; empty when it is
-    exact: bool = False  # no eigenvalue outside lies right of ``value`` by more than a thousandth of it
-    shift: float = 0.0  # real point whose neighbours were searched [1/s]
+    """Whether the sign is proved: ``value`` >= 0, or no eigenvalue with Re s >= 0 lies outside the radius."""
+    radius: float
+    """Radius |s| up to which all eigenvalues with Re s >= 0 are computed [1/s]."""
+    bound: float
+    """Bound of |K (sE - A)^{-1} B| over Re s >= 0, |s| >= radius; below 1 it excludes eigenvalues there."""
+    eigenvalues: np.ndarray
+    """Computed eigenvalues, nearest to ``shift`` first [1/s], (k,)."""
+    reason: str = ""
+    """Why the sign is not certified; empty when it is."""
+    exact: bool = False
+    """Whether the abscissa exceeds ``value`` by at most a thousandth of it."""
+    shift: float = 0.0
+    """Real centre of the computed eigenvalues [1/s]."""
 
     @property
     def stable(self) -> bool:
@@ -58,7 +63,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | N
     """Largest real part of the spectrum of x' = (A + B K) x [1/s], with a certificate of its sign. Collective.
 
     Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it:
-    :class:`softgrasp.lqr.spectrum.tail.Tail` excludes eigenvalues with Re s >= 0 beyond a radius r; the circle
+    :class:`softgrasp.lqr.spectrum.tail.TailBound` excludes eigenvalues with Re s >= 0 beyond a radius r; the circle
     |s - sigma| <= d with d^2 = r^2 + sigma^2 holds all others with Re s >= 0. Kelvin-Voigt damping makes infinitely
     many eigenvalues accumulate at -1/beta as the mesh gets finer; sigma is chosen so that the circle leaves them
     outside. One solve with sigma^2 M_ee + sigma D_ee + K_ee a step, factored once; the few inputs enter by
@@ -70,7 +75,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | N
     Args:
         problem: the plant; damped in every layer for a certificate.
         gain: u = K x.
-        modes: see :class:`softgrasp.lqr.spectrum.tail.Tail`, when they are there already.
+        modes: see :class:`softgrasp.lqr.spectrum.tail.TailBound`, when they are there already.
 
     Raises:
         ControlError: the plant has no hand.
@@ -88,10 +93,10 @@ def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | N
         )
     K_q = K.hand[:n_s].T
     if not np.linalg.svd(K_q, compute_uv=False)[-1] > 100 * EPS * np.linalg.norm(K.hand):
-        reason = "the gain on a rigid displacement is singular: the hand is not held"
+        reason = "the gain on a rigid displacement is singular: the hand is not controlled"
         return Abscissa(0.0, True, 0.0, np.inf, np.zeros(1, dtype=complex), reason)
     why = why_no_bound(problem)
-    tail = None if why else Tail(problem, K, modes)
+    tail = None if why else TailBound(problem, K, modes)
     # the same bits on every rank: they decide how often all search
     aim, shift, guess = problem.layout.comm.bcast(_circle(problem, tail))
     resolvent = Resolvent(problem, K, shift)
@@ -109,7 +114,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | N
     return result
 
 
-def _circle(problem: RiccatiProblem, tail: Tail | None) -> tuple[float, float, int]:
+def _circle(problem: RiccatiProblem, tail: TailBound | None) -> tuple[float, float, int]:
     """Radius to cover, centre sigma of the search, and how many eigenvalues lie there if feedback moved none.
 
     Collective.
@@ -128,7 +133,7 @@ def _circle(problem: RiccatiProblem, tail: Tail | None) -> tuple[float, float, i
     return radius, max(radius / 4, beta * radius**2), min(2 * problem.layout.n_s + 2 * inside, GROWTH[-1])
 
 
-def _conclude(values: np.ndarray, shift: float, tail: Tail | None, why: str) -> Abscissa:
+def _conclude(values: np.ndarray, shift: float, tail: TailBound | None, why: str) -> Abscissa:
     """What the eigenvalues nearest to the shift say."""
     distance = np.abs(values - shift)
     order = np.argsort(distance)

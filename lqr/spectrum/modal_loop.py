@@ -24,8 +24,8 @@ class SampledRadius:
     """Spectral radius of a loop from tick to tick, see :mod:`softgrasp.lqr.spectrum.sampled`."""
 
     value: float  # largest modulus of an eigenvalue; of the modes kept where not ``exact``
-    certified: bool = True  # the radius of the whole plant lies on the same side of 1
-    exact: bool = True  # all modes were kept
+    certified: bool = True  # whether the radius of the whole plant is proved to lie on the same side of 1
+    exact: bool = True  # whether all modes are kept
     reason: str = ""  # why it is not certified; empty when it is
 
     @property
@@ -38,13 +38,13 @@ class SampledRadius:
 class LoopQuality:
     """The full plant under one gain."""
 
-    abscissa: float  # largest real part of the closed-loop spectrum [1/s], or a lower bound where not ``exact``
-    cost_excess: float  # J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable
-    # its sign is certain: from the whole spectrum, or from softgrasp.lqr.spectrum.certificate.abscissa
+    abscissa: float  # largest real part of the closed-loop spectrum, or a lower bound where not ``exact`` [1/s]
+    cost_excess: float  # excess cost J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable
+    # whether the sign of ``abscissa`` is proved: by the whole spectrum, or softgrasp.lqr.spectrum.certificate.abscissa
     certified: bool = True
-    exact: bool = True  # the abscissa is that of the whole spectrum, or exceeded by it by at most a thousandth
-    poles: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=complex))  # eigenvalues behind it
-    sampled: SampledRadius | None = None  # from tick to tick, where the instants of the loop are known
+    exact: bool = True  # whether the abscissa of the whole spectrum exceeds ``abscissa`` by at most a thousandth
+    poles: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=complex))  # computed eigenvalues [1/s], (k,)
+    sampled: SampledRadius | None = None  # radius from tick to tick; None where the instants are unknown
 
     @property
     def stable(self) -> bool:

@@ -1,4 +1,4 @@
-"""Spectral radius of a loop whose input is sampled, held and late; a continuous-time certificate says nothing of it."""
+"""Spectral radius of a loop with sampled, held and delayed input; a continuous-time certificate does not cover it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, FEW, ModalLoop, SampledRadius
-from softgrasp.lqr.spectrum.tail import Tail, tail_modes
+from softgrasp.lqr.spectrum.tail import TailBound, tail_modes
 
 SAFE = 0.5  # small gain below which the modes left out are harmless; the rest covers what lies between grid points
 GRID = 1000  # points on the upper half of the unit circle, and these around every eigenvalue, in its distances from it:
@@ -29,7 +29,7 @@ class Sampling:
     """The instants of a loop."""
 
     dt: float  # time step of the midpoint rule [s]
-    every: int = 0  # steps in one tick, during which the input is held; 0 takes the law at the midpoint of every step
+    every: int = 0  # steps of one tick, with a held input; 0: the law at the midpoint of every step
     delay: int = 0  # ticks from a sample to the load that it commands
 
     @classmethod
@@ -42,31 +42,31 @@ class Sampling:
 class StableRate:
     """A rate at which a loop is stable."""
 
-    rate: float  # [Hz]
-    steps: int  # time steps that fit it until the end of the scene
-    radius: float  # there
+    rate: float  # rate of the loop [Hz]
+    steps: int  # number of time steps until the end of the scene at this rate
+    radius: float  # spectral radius from tick to tick at this rate
 
 
 @dataclass(frozen=True)
 class _Parts:
-    """x' = A x + B u, u = k x on the modes kept, and what is left out; ``rest`` None where no bound is known."""
+    """x' = A x + B u, u = k x on the modes kept, and the modes left out."""
 
-    A: Array
-    B: Array
-    k: Array
-    exact: bool
-    rest: _Rest | None = None
-    reason: str = ""
+    A: Array  # state matrix, (N, N)
+    B: Array  # input matrix, (N, n_s)
+    k: Array  # gain, (n_s, N)
+    exact: bool  # whether all modes are kept
+    rest: _Rest | None = None  # modes left out; None where no bound on them is known
+    reason: str = ""  # why the radius is not certified; empty when it is
 
 
 @dataclass(frozen=True)
 class _Rest:
-    """Modes left out: |gain| |force| over them, their frequencies, damping alpha + beta omega^2, drag of the hand."""
+    """Bound on the modes left out."""
 
-    size: float
-    omega: Array
-    twice: Array
-    drag: float
+    size: float  # product |gain| |force| over all modes left out
+    omega: Array  # sampled frequencies of their range [1/s], (F,)
+    twice: Array  # damping 2 delta = alpha + beta omega^2 at these frequencies [1/s], (F,)
+    drag: float  # mass-proportional damping alpha where it acts in space, else 0 [1/s]
 
 
 def midpoint_radius(poles: np.ndarray, dt: float) -> float:
@@ -105,7 +105,7 @@ class SampledLoop:
 
     |(I - L)^{-1}| is evaluated on a grid that resolves every eigenvalue by its distance from the circle; |D| is
     bounded mode by mode in the energy norm and summed by Cauchy-Schwarz as in
-    :class:`softgrasp.lqr.spectrum.tail.Tail`. Where this fails, all modes are taken, up to
+    :class:`softgrasp.lqr.spectrum.tail.TailBound`. Where this fails, all modes are taken, up to
     :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`. Rounding, the mesh of the grids and the residual of the modes
     are not bounded.
 
@@ -200,7 +200,7 @@ class SampledLoop:
             return _Parts(loop.A, loop.B, loop.gain(K), loop.complete, reason=reason)
         if self.lowest is None:
             self.lowest = tail_modes(self.problem, self.kept)
-        tail = Tail(self.problem, K, self.lowest)
+        tail = TailBound(self.problem, K, self.lowest)
         n_s, M_s, omega = self.problem.layout.n_s, self.problem.M_s, tail.omega
         K_z, K_v, force = tail.parts
         ends = np.cumsum([0, n_s, n_s, len(omega), len(omega)]).tolist()

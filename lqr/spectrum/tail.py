@@ -1,4 +1,4 @@
-"""A bound on the loop gain far from the origin: it excludes closed-loop eigenvalues that no iteration was asked for."""
+"""A bound on the loop gain far from the origin: it excludes closed-loop eigenvalues that were not computed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MODES = 60
 
 
 def why_no_bound(problem: RiccatiProblem) -> str:
-    """Why :class:`Tail` does not apply; empty when it does."""
+    """Why :class:`TailBound` does not apply; empty when it does."""
     system, damping = problem.system, problem.system.damping
     if not damping.active:
         return "no damping: modes beyond the radius stay on the axis"
@@ -43,7 +43,7 @@ def tail_modes(problem: RiccatiProblem, k: int = MODES) -> tuple[Array, Array]:
     return plant_modes(Plant(problem), k) if problem.system.two_way else modes_of_plant(problem, k)[:2]
 
 
-class Tail:
+class TailBound:
     """Bound of |h(s)|, h(s) = K (sE - A)^{-1} B, for Re s >= -a, |s| >= r: an eigenvalue of A + B K needs |h(s)| >= 1.
 
     Where the bound is finite, A itself has no eigenvalue. One-way, with the modes phi_k of the clamped tissue,
@@ -80,7 +80,7 @@ class Tail:
         self.coupled = modes_couple(system)
         self.drag = system.damping.drag
         force = system.G @ inverse
-        if system.two_way:  # the hand gives way: q_s = M_s^{-1} (u / s^2 - G'z)
+        if system.two_way:  # the hand is free: q_s = M_s^{-1} (u / s^2 - G'z)
             gain_z, gain_v = gain_z - force @ hand_q, gain_v - force @ hand_v
         self.omega, Phi = tail_modes(problem) if modes is None else modes
         columns = np.hstack([gain_z, gain_v, force])
@@ -88,13 +88,13 @@ class Tail:
         self.parts = np.hsplit(size, 3)  # gain on z and v, and force, of each mode
         self.modes = np.linalg.norm(np.stack(self.parts), axis=2)
         # the rest itself: as a difference of norms it would lose half the digits
-        rest = columns - _moved_mass(problem, Phi) @ size
-        self.rest_z, self.rest_v, self.rest_force = _norms(problem, rest, _inverse_mass(problem, rest), 3)
+        rest = columns - _schur_mass(problem, Phi) @ size
+        self.rest_z, self.rest_v, self.rest_force = _norms(problem, rest, _inverse_schur_mass(problem, rest), 3)
         static = static_columns(system, rest[:, 2 * n_s :])
-        (self.rest_static,) = _norms(problem, static, _moved_mass(problem, static), 1)
+        (self.rest_static,) = _norms(problem, static, _schur_mass(problem, static), 1)
 
     def bound(self, r: float, a: float = 0.0) -> float:
-        """The bound at radius r for Re s >= -a, 0 <= a < r; infinite where it says nothing."""
+        """The bound at radius r for Re s >= -a, 0 <= a < r; infinite where no bound is known."""
         if not 0 <= a < r or (a > 0 and (self.coupled or self.drag > 0)):
             return np.inf
         hand = self.K_q / r**2 + self.K_v / r
@@ -143,8 +143,8 @@ def _norms(problem: RiccatiProblem, X: Array, W_X: Array, parts: int) -> list[fl
     return [float(np.sqrt(max(part.sum(), 0.0))) for part in np.split(squares, parts)]
 
 
-def _moved_mass(problem: RiccatiProblem, X: Array) -> Array:
-    """M_ee X, two-way (M_ee - G M_s^{-1} G') X, local rows. Collective."""
+def _schur_mass(problem: RiccatiProblem, X: Array) -> Array:
+    """M_ee X, two-way (M_ee - G M_s^{-1} G') X: the mass with the free hand eliminated; local rows. Collective."""
     system = problem.system
     result = times_columns(system.M_ee, X)
     if system.two_way:
@@ -152,7 +152,7 @@ def _moved_mass(problem: RiccatiProblem, X: Array) -> Array:
     return result
 
 
-def _inverse_mass(problem: RiccatiProblem, X: Array) -> Array:
+def _inverse_schur_mass(problem: RiccatiProblem, X: Array) -> Array:
     """M_ee^{-1} X, two-way (M_ee - G M_s^{-1} G')^{-1} X, local rows. Collective."""
     system, comm = problem.system, problem.layout.comm
     if not system.two_way:

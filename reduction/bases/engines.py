@@ -23,7 +23,7 @@ import scipy.linalg
 from mpi4py import MPI
 from slepc4py import SLEPc
 
-from softgrasp.fem.errors import SolverError, agree
+from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.petsc import Array, PETSc, on_root, total
 from softgrasp.reduction.bases.states import BasisError
 
@@ -163,7 +163,7 @@ def _flat(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
     if comm.size == 1:
         return np.asfortranarray(Q_local), R_local
     parts, blocks, R = comm.gather(R_local), None, None
-    with agree(comm):
+    with raise_on_all_ranks(comm):
         if parts is not None:
             Q, R = np.linalg.qr(np.vstack(parts))
             blocks = np.split(Q, np.cumsum([len(part) for part in parts])[:-1])

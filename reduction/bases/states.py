@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softgrasp.fem.errors import agree
+from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.run.snapshots import Snapshots
@@ -83,7 +83,7 @@ class States:
         """
         if not any(snapshots.Z.shape[1] for _, snapshots in self.runs):
             raise BasisError("there are no snapshots; run with output.snapshots = 'memory', or use craig_bampton")
-        with agree(self.layout.comm):
+        with raise_on_all_ranks(self.layout.comm):
             for system, snapshots in self.runs:
                 _check(self.layout, system, snapshots)
         parts = [_columns(system, snapshots, coordinates, frame) for system, snapshots in self.runs]

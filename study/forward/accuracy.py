@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgrasp.fem.accuracy.adapt import estimated
-from softgrasp.fem.accuracy.estimate import next_unknowns
+from softgrasp.fem.accuracy.price import affordable, plans
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.study.report.tables import percent
 
@@ -17,33 +18,24 @@ if TYPE_CHECKING:
     from softgrasp.fem.model.build import MeshEstimate, Model
     from softgrasp.fem.run.trajectory import Trajectory
 
-CHEAP = 1.0  # [s]; what costs less is done unasked
-# Seconds of an estimate, measured on one core: graded meshes to compare with (by dimension, and in 3D dearer for mesh
-# files, whose edges are bisected), and static solves on the mesh itself.
-BASE = {2: 0.3, 3: 0.9}
-BASE_FILE = {2: 0.3, 3: 3.5}
-PER_UNKNOWN = {2: 1.5e-5, 3: 4e-5}
-PER_STEP = 3e-5  # of the small models that are run
 NOT_LINEAR = "The error of mesh and time step is estimated for linear elasticity only"
 
 
-def estimate_error(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | None, str]:
-    """The estimate of a model's mesh where it is there, cheap or asked for, and why it is not. Collective.
+def estimate_error(model: Model, budget: float | None = None) -> tuple[MeshEstimate | None, str]:
+    """The estimate of a model's mesh, or why there is none. Collective.
 
-    ``seconds``: what its run took, equal on all ranks; ``certify``: estimate whatever it costs.
+    ``budget``: seconds of counted work (:mod:`softgrasp.fem.accuracy.price`) that it may take; None: any.
     """
     if model.system.points is not None:  # the small models are of linear elasticity
         return None, f"{NOT_LINEAR}; with effects.finite_strain compare with a finer mesh and more steps."
     if model.accuracy is not None:
         return model.accuracy, ""
-    d, n_e = model.system.layout.dimension, model.system.layout.n_e
-    box = model.scene.tissue.size is not None
-    base, n = (BASE, n_e) if box else (BASE_FILE, next_unknowns(model))
-    cost = base[d] + PER_UNKNOWN[d] * n + PER_STEP * model.scene.time.steps
-    if not certify and cost > max(CHEAP, seconds):
-        return None, ""
+    plan = affordable(model, math.inf if budget is None else budget)
+    if plan is None:
+        least = min(plan.seconds for plan in plans(model))
+        return None, f"The error of the mesh is not estimated: that would take about {least:.2g} s; --certify does it."
     try:
-        return estimated(model), ""
+        return estimated(model, **plan.how), ""
     except (SoftgraspError, np.linalg.LinAlgError) as error:
         return None, f"The error of the mesh could not be estimated: {error}"
 
@@ -65,7 +57,7 @@ def accuracy_report(result: MeshEstimate | None, run: Trajectory) -> AccuracyRep
     keys = {
         "estimate": result.estimate,
         "bound": result.bound,
-        "corrected": result.corrected(run.outputs)[-1].tolist(),
+        "corrected": None if result.by == "coarser" else result.corrected(run.outputs)[-1].tolist(),
         "omega": list(result.omega),
         "passes": result.passes,
         "n_e": result.n_e,
@@ -92,12 +84,18 @@ def accuracy_report(result: MeshEstimate | None, run: Trajectory) -> AccuracyRep
             f"The contact zone ends {result.shift:.3g} m off contact.box, because its facets count by their midpoints; "
             "[tissue.refine] makes mesh lines meet it."
         )
+    on = (
+        "as estimated on coarser cells; simulate --certify does it on these"
+        if result.by == "coarser"
+        else "on this mesh"
+    )
+    less = " or less" if result.by == "coarser" else ""
     return AccuracyReport(
         keys={"mesh_error": keys, "time_error": result.time_error},
         rows=[
-            ("deformation", f"about {off} off on this mesh (bound {bound}){better}"),
+            ("deformation", f"about {off} off{less} {on} (bound {bound}){better}"),
             ("", f"about {in_time} off by the time step"),
         ],
-        summary=[f"The deformation is about {off} off by the mesh and {in_time} by the time step."],
+        summary=[f"The deformation is about {off} off{less} by the mesh and {in_time} by the time step."],
         warnings=warnings,
     )

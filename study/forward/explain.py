@@ -28,7 +28,7 @@ from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.files import to_json
 
 MODES = 6
-ESTIMATE_SECONDS, ESTIMATE_UNKNOWNS = 4.0, 25_000  # a dearer estimate of the mesh is left to simulate --certify
+ESTIMATE_SECONDS = 0.5  # a dearer estimate of the mesh is left to simulate
 LARGE = 200_000  # cells beyond which rank 0 does not look for the ends
 
 
@@ -185,7 +185,7 @@ def mesh_report(model: Model) -> MeshReport:
     graded = refine is not None and refine.grading != "off"
     edges = graded and tissue.dimension == 3 and not by_lines(scene)
     order = 2.0 * scene.tissue.order if ends is None else expected_order(ends, scene.tissue.order, graded, edges)
-    error = estimate_error(model, ESTIMATE_SECONDS if model.system.layout.n_e <= ESTIMATE_UNKNOWNS else 0.0, False)[0]
+    error = estimate_error(model, ESTIMATE_SECONDS)[0]
     values = (None,) * 4 if error is None else (error.estimate, error.bound, error.time_error, error.shift)
     first = refine is not None and refine.tolerance is not None and refine.passes > 0
     return MeshReport(kinds, order, graded, first, *values)

@@ -163,14 +163,14 @@ class Simulation:
 def newton_keys(newton: NewtonFigures) -> dict[str, float]:
     """How the steps of finite strain converged, for result.json."""
     keys = {"mean": newton.mean, "max": newton.max, "factors": newton.factors, "min_J": newton.min_det}
-    return {**keys, "divided": newton.divided}
+    return {**keys, "divided": newton.substepped}
 
 
 def newton_text(newton: NewtonFigures) -> str:
     """How the steps of finite strain converged, in words."""
-    parts = f", {counted(newton.divided, 'step')} in parts" if newton.divided else ""
+    substeps = f", {counted(newton.substepped, 'step')} by substeps" if newton.substepped else ""
     return (
-        f"{newton.mean:.3g} a step, at most {newton.max}, {counted(newton.factors, 'new tangent')}{parts}; "
+        f"{newton.mean:.3g} a step, at most {newton.max}, {counted(newton.factors, 'new tangent')}{substeps}; "
         f"smallest det F {newton.min_det:.3g}"
     )
 

@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
+from softgrasp.fem.accuracy.price import SHARE, run_seconds
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError, SolverError
 from softgrasp.fem.mesh.check import counted
@@ -85,14 +86,14 @@ def run_simulate(
     result = simulate_result(model, run, run_warnings(model, run, frames.most[1:]))
     tables = {"trajectory.csv": result.trajectory()}
     session.keep(scene, result.to_json(), tables)
-    mesh_error, unknown = estimate_error(model, run.seconds["steps"], certify)
+    mesh_error, unknown = estimate_error(model, None if certify else SHARE * run_seconds(model))
     accuracy = accuracy_report(mesh_error, run)
     result = replace(result, warnings=(*result.warnings, *accuracy.warnings, *([unknown] if unknown else [])))
     rows = [*result.rows(), *accuracy.rows]
 
     def page() -> Page:
         drawn = frames.draw(out, run)
-        if session.pictures and mesh_error is not None:
+        if session.pictures and mesh_error is not None and mesh_error.by != "coarser":
             from softgrasp.study.forward.plots import figure_mesh_error  # brings Matplotlib
 
             drawn += figure_mesh_error(out / "mesh_error.png", run, mesh_error)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from softgrasp.fem.checksums import AGAIN, read_arrays, write_arrays
-from softgrasp.fem.errors import CheckpointError, agree
+from softgrasp.fem.errors import CheckpointError, raise_on_all_ranks
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
 from softgrasp.fem.fields.series import SeriesWriter
 from softgrasp.fem.fields.vtu import note_of
@@ -55,7 +55,7 @@ class Frames:
         self.legs = run.legs
         if self.writer is not None:
             self.writer.rename(_series(run.begun), run.name)
-        with agree(run.layout.comm):
+        with raise_on_all_ranks(run.layout.comm):
             if run.layout.comm.rank == 0:
                 self._remove_series(run)
             if self.picture is not None and run.begun:  # rank 0
@@ -89,7 +89,7 @@ class Frames:
 
         Raises CheckpointError: they cannot be written.
         """
-        with agree(run.layout.comm):
+        with raise_on_all_ranks(run.layout.comm):
             if run.layout.comm.rank > 0:
                 return
             try:

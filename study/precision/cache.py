@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from softgrasp import package_version
 from softgrasp.fem.checksums import read_manifest, write_manifest
-from softgrasp.fem.errors import CheckpointError, Interrupted, agree
+from softgrasp.fem.errors import CheckpointError, Interrupted, raise_on_all_ranks
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
@@ -39,7 +39,7 @@ class Cache:
         self.stop: list[bool] = []  # filled by the first Ctrl-C
         self.count, self.done = 1, 0  # points in all, as far as they are known, and those begun
         self.scene = ""  # rank 0 looks for the files
-        with agree(comm):
+        with raise_on_all_ranks(comm):
             if comm.rank == 0:
                 self.scene = scene_hash(scene, ("name", "description", "reduction", "output"))
         self.hits = self.misses = 0
@@ -76,7 +76,7 @@ class Cache:
             return [_revived(of, row) for row in rows]
         self.misses += 1
         rows = json.loads(json.dumps(to_json(list(measure()))))
-        with agree(self.comm):
+        with raise_on_all_ranks(self.comm):
             if self.comm.rank == 0:
                 self.folder.mkdir(parents=True, exist_ok=True)
                 write_manifest(self.path(kind, key), {"format": FORMAT, "kind": kind, "key": key, "value": rows})

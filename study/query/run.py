@@ -12,7 +12,7 @@ import h5py
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.fem.errors import SceneError, agree
+from softgrasp.fem.errors import SceneError, raise_on_all_ranks
 from softgrasp.fem.mesh.scene_hash import scene_keys
 from softgrasp.fem.model.build import Model, Stopwatch, build
 from softgrasp.fem.owned import follow
@@ -85,7 +85,7 @@ def run_query(
     model = load_certified(path)
     many = [materials_of(model, setting) for setting in questions]
     drive = drive_of(model, motion, dt, len(many))
-    with agree(MPI.COMM_WORLD):
+    with raise_on_all_ranks(MPI.COMM_WORLD):
         if folder is not None and MPI.COMM_WORLD.rank == 0:
             read = [file for file in (path, motion, scene, batch) if file is not None]
             claim(folder, "query", model.fine.name, inputs=read, empty=empty)
@@ -110,12 +110,12 @@ def run_query(
     answers = QueryResult(path, model, each, seconds, batch is not None)
     _show(console, answers)
     if out is not None and any(answer.run is not None for answer in each):
-        with agree(MPI.COMM_WORLD):
+        with raise_on_all_ranks(MPI.COMM_WORLD):
             if MPI.COMM_WORLD.rank == 0:
                 answers.table().write_csv(out)
         list_files(console, [out])
     if folder is not None:
-        with agree(MPI.COMM_WORLD):
+        with raise_on_all_ranks(MPI.COMM_WORLD):
             if MPI.COMM_WORLD.rank == 0:
                 given = {"motion": motion, "dt": dt, "tolerance": tolerance, "fallback": fallback, "batch": batch}
                 options = [f"--{key} {shlex.quote(str(value))}" for key, value in given.items() if value is not None]

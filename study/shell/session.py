@@ -17,7 +17,7 @@ from rich.padding import Padding
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from softgrasp.fem.errors import agree
+from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.owned import follow
 from softgrasp.fem.scene.file import find_scene, load_scene_collective
@@ -74,7 +74,7 @@ class Session:
         Raises SceneError: the file or a key is wrong, or the folder holds another run.
         """
         scene = load_scene_collective(self.comm, self.path, self.overrides)
-        with agree(self.comm):
+        with raise_on_all_ranks(self.comm):
             if writes and self.comm.rank == 0:
                 named = [scene.path(file) for file in (scene.tissue.mesh, scene.motion.csv) if file is not None]
                 claim(self.out, self.command, scene.name, inputs=[find_scene(self.path), *named], empty=self.empty)
@@ -116,7 +116,7 @@ class Session:
 
         Raises OSError on all ranks: the folder cannot be written.
         """
-        with agree(self.comm):
+        with raise_on_all_ranks(self.comm):
             if self.comm.rank == 0:
                 self.out.mkdir(parents=True, exist_ok=True)
                 before = files_of(read_result(self.out))
@@ -137,7 +137,7 @@ class Session:
         Raises OSError on all ranks: the folder cannot be written.
         """
         files: list[Path] = []
-        with agree(self.comm):
+        with raise_on_all_ranks(self.comm):
             if self.comm.rank == 0:
                 self.out.mkdir(parents=True, exist_ok=True)
                 before = files_of(read_result(self.out))

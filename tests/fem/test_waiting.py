@@ -7,19 +7,19 @@ import time
 import pytest
 from mpi4py import MPI
 
-from softgrasp.fem.errors import SceneError, agree
+from softgrasp.fem.errors import SceneError, raise_on_all_ranks
 from softgrasp.fem.petsc import on_root
 
 WORK = 1.0  # [s] that rank 0 takes, asleep itself, so that what others spend is theirs
 
 
 @pytest.mark.ranks
-@pytest.mark.parametrize("how", ["agree", "on_root"])
+@pytest.mark.parametrize("how", ["raise_on_all_ranks", "on_root"])
 def test_ranks_that_wait_sleep(comm: MPI.Intracomm, how: str) -> None:
     comm.Barrier()
     begin = time.process_time()
-    if how == "agree":
-        with agree(comm):
+    if how == "raise_on_all_ranks":
+        with raise_on_all_ranks(comm):
             time.sleep(WORK * (comm.rank == 0))
     else:
         on_root(comm, lambda: time.sleep(WORK))
@@ -30,7 +30,7 @@ def test_ranks_that_wait_sleep(comm: MPI.Intracomm, how: str) -> None:
 @pytest.mark.ranks
 def test_an_error_reaches_the_ranks_that_sleep(comm: MPI.Intracomm) -> None:
     def fail() -> None:
-        with agree(comm):
+        with raise_on_all_ranks(comm):
             if comm.rank == 0:
                 time.sleep(0.1)
                 raise SceneError("of rank 0")

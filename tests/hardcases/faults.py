@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 from mpi4py import MPI
 from pydantic import TypeAdapter, ValidationError
@@ -102,22 +103,60 @@ def type_check_accepts(kind: str) -> int:
 
 
 def number_rows(quick: bool) -> Iterator[HardCase]:
-    """One row a section of the scene; then files and forces with NaN."""
+    """All keys of the scene in one row, since a zero says the same of each; then files and forces with NaN."""
     keys = numeric_keys()
-    sections = list(dict.fromkeys(path.split(".", 1)[0] for path, _, _ in keys))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "scene.toml"
         file.write_text(SCENE)
         load_scene(file)
-        for i, section in enumerate(sections):
-            own = [key for key in keys if key[0].split(".", 1)[0] == section]
-            taken = [note for path, _, text in own for note in accepted(file, path, text)]
-            answer = Outcome(float(len(taken)), taken[0] if taken else "")
-            accepts = Outcome(float(sum(type_check_accepts(kind) for _, kind, _ in own)))
-            reason = "every one must be refused, and the sentence must name the key"
-            yield HardCase(f"[{section}], {len(own)} keys", i + 1, answer, accepts, 0.0, reason)
-        yield from _file_rows(Path(folder), file, len(sections) + 1)
-    yield _force_row(len(sections) + 3)
+        taken = [note for path, _, text in keys for note in accepted(file, path, text)]
+        answer = Outcome(float(len(taken)), taken[0] if taken else "")
+        accepts = Outcome(float(sum(type_check_accepts(kind) for _, kind, _ in keys)))
+        reason = "every one must be refused, and the sentence must name the key"
+        yield HardCase(f"NaN and infinity in {len(keys)} keys", 1, answer, accepts, 0.0, reason)
+        yield from _file_rows(Path(folder), file, 2)
+    yield _force_row(4)
+
+
+EXCLUSIVE = (  # what excludes each other, overrides of SCENE
+    ("turning hand, finite strain", (
+        "effects.rotation=true", "hand.inertia=3.0", "motion.target=[5.0, 3.0, 0.3]", "effects.finite_strain={}",
+        "effects.damping=false")),
+    ("turning hand without inertia", ("effects.rotation=true", "motion.target=[5.0, 3.0, 0.3]")),
+    ("start in equilibrium without gravity", ("effects.gravity=false", "time.start='equilibrium'")),
+    ("damped layer without damping", ("effects.damping=false", "tissue.layers.low.beta=0.1")),
+    ("facet marks of a structured box", ("contact.facet_tag=3",)),
+    ("thickness in 3D", (
+        "tissue.size=[1.0, 1.0, 2.0]", "tissue.cells=[1, 1, 2]", "tissue.thickness=0.5", "tissue.layers={}",
+        "contact={sides=['left']}", "motion.target=[1.0, 0.0, 0.0]", "effects.gravity=false", "control=false")),
+)  # fmt: skip
+
+
+def exclusive_rows(quick: bool) -> Iterator[HardCase]:
+    """Effects and keys that exclude each other, each of them right by itself."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "scene.toml"
+        file.write_text(SCENE)
+        for i, (name, changes) in enumerate(EXCLUSIVE[::2] if quick else EXCLUSIVE):
+            ours = here(lambda: float(load_scene(file, list(changes)).time_end))  # noqa: B023  (at once)
+            theirs = textbook(by_schema, list(changes))
+            yield HardCase(name, i + 1, ours, theirs, None, "no model is meant by both together")
+
+
+def by_schema(changes: list[str]) -> Outcome:
+    """What a check of the scene against its JSON schema says, key by key."""
+    data = tomllib.loads(SCENE)
+    for change in changes:
+        path, value = change.split("=", 1)
+        *parents, last = path.split(".")
+        table = data
+        for key in parents:
+            table = table.setdefault(key, {})
+        table[last] = tomllib.loads(f"x = {value}")["x"]
+        if table[last] is False and last not in ("rotation", "reaction"):
+            del table[last]  # false leaves an optional table out
+    jsonschema.validate(data, scene_schema())
+    return Outcome(None, "every key fits the schema")
 
 
 def _file_rows(folder: Path, scene: Path, at: int) -> Iterator[HardCase]:
@@ -226,9 +265,12 @@ def rank_rows(quick: bool) -> Iterator[HardCase]:
 
 
 FAMILIES = (
-    Family("numbers", "NaN and infinity in every numeric key", "section", "bad values taken", "type check alone",
+    Family("numbers", "NaN and infinity in every numeric key", "place", "bad values taken", "type check alone",
            "NaN is a float to TOML and to every type check; each key has to ask for a finite number.", number_rows,
            axis="listed"),
+    Family("exclusive", "Effects and keys that exclude each other", "pair", "must be refused", "the JSON schema",
+           "Each key is right by itself, so a schema takes them all; the sentence here names both.",
+           exclusive_rows, axis="listed"),
     Family("rank", "A rank that fails alone", "fault", "time until all ranks have ended / time of a healthy run",
            "bare mpi4py script",
            "In a bare script the healthy rank waits for ever, or goes on with the NaN of the other; here all ranks "

@@ -49,7 +49,7 @@ def write_files(out: Path, result: HardCaseResult, family: str | None, pictures:
     figures = {
         f.family.name: figure_family(f.family, f.cases, out / f"hard_{f.family.name}.png")
         for f in result.families
-        if pictures and f.cases
+        if pictures and any(o.value is not None for case in f.cases for o in (case.here, case.textbook))
     }
     options = (" --quick" if result.quick else "") + (f" --family {family}" if family else "")
     files = [write_json(out / "result.json", result.to_dict()), csv_table(result).write_csv(out / "hardcases.csv")]
@@ -231,7 +231,7 @@ def _listed(family: Family, rows: Sequence[HardCase]) -> Any:
     """One line a case; numbers to the right, on a logarithm when some of them are small."""
     figure, ax = plt.subplots(figsize=(WIDTH, 0.95 + 0.33 * len(rows)), layout="constrained")
     values = [v for r in rows for v in (r.here.value, r.textbook.value, r.bound) if v is not None and math.isfinite(v)]
-    scaled = min((v for v in values if v > 0), default=1.0) < 1e-2
+    scaled = min((v for v in values if v > 0), default=1.0) < 1e-2 or max(values, default=1.0) > 1e3
     if scaled:
         low, high = _range(rows)
     else:

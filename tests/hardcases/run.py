@@ -13,11 +13,11 @@ from rich.progress import MofNCompleteColumn
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.study.shell.folder import claim, folder_lock
 from softgrasp.study.shell.session import list_files, progress_bar
-from tests.hardcases import certified, faults, motion, reduction, riccati, statics
+from tests.hardcases import certified, estimates, faults, loops, motion, reduction, riccati, statics
 from tests.hardcases.cases import Family, FamilyResult, HardCaseResult
 from tests.hardcases.page import show, write_files
 
-MODULES: Any = (statics, motion, reduction, certified, riccati, faults)
+MODULES: Any = (statics, estimates, motion, reduction, certified, riccati, loops, faults)
 FAMILIES: dict[str, Family] = {family.name: family for module in MODULES for family in module.FAMILIES}
 
 
@@ -63,6 +63,7 @@ def run_hardcases(
             show(console, results[-1])
             bar.advance(task)
     result = HardCaseResult(tuple(results), quick)
+    out.mkdir(parents=True, exist_ok=True)  # a case that ran in a folder of its own may have given this one back
     files = write_files(out, result, family, pictures)
     console.print(result.summary, soft_wrap=True)
     list_files(console, files)

@@ -21,7 +21,7 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.riccati import solve
 from softgrasp.lqr.spectrum.certificate import abscissa
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
-from softgrasp.lqr.spectrum.tail import Tail
+from softgrasp.lqr.spectrum.tail import TailBound
 from tests.helpers.models import LAYERS, make_scene
 
 SCENES = Path(__file__).parents[2] / "demos" / "scenes"
@@ -86,7 +86,7 @@ def test_the_bound_holds_where_damping_is_not_proportional(changes: tuple[dict[s
     assert found.stable, found.reason
     loop = ModalLoop(problem, DENSE_LIMIT)
     assert abs(found.value - loop.poles(K).real.max()) < 1e-8  # tolerance 1e-9 of poles of size 10
-    tail, k, one = Tail(problem, K), loop.gain(K), np.eye(len(loop.A))
+    tail, k, one = TailBound(problem, K), loop.gain(K), np.eye(len(loop.A))
     for r in (0.3, 1.0, 10.0, 100.0):
         near = np.geomspace(r, 1e3 * r, 40)
         size = max(np.linalg.norm(k @ np.linalg.solve(1j * w * one - loop.A, loop.B), 2) for w in near)
@@ -97,7 +97,7 @@ def test_the_shifted_bound_holds_left_of_the_axis() -> None:
     """For Re s >= -a; half the decay of the slowest mode, and beyond it, where only |s| > omega_k helps."""
     problem = small(KELVIN)
     K = gain(problem)
-    loop, tail = ModalLoop(problem, DENSE_LIMIT), Tail(problem, K)
+    loop, tail = ModalLoop(problem, DENSE_LIMIT), TailBound(problem, K)
     k, one = loop.gain(K), np.eye(len(loop.A))
     own = 0.003 * tail.omega[0] ** 2 / 2
     for a, r in ((0.5 * own, 2.0), (0.5 * own, 20.0), (1.2 * own, 20.0)):

@@ -15,7 +15,7 @@ from softgrasp.lqr.dense.care import StateSpace
 from softgrasp.lqr.dense.modal import relative_space
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.spectrum.tail import Tail, why_no_bound
+from softgrasp.lqr.spectrum.tail import TailBound, why_no_bound
 
 COMM = MPI.COMM_SELF
 KINDS = ["kelvin", "rayleigh", "space", "layers", "two-way", "two-way-alpha", "two-way-layers"]
@@ -91,7 +91,7 @@ def test_no_loop_gain_exceeds_the_bound(kind: str, light: bool, monkeypatch: pyt
     slow = np.sort(-own.real)
     tightest, finite = 0.0, 0
     for K in gains(problem, space, rng):
-        tail = Tail(problem, Block(K[:, : 2 * N_S].T.copy(), K[:, 2 * N_S :].T.copy()))
+        tail = TailBound(problem, Block(K[:, : 2 * N_S].T.copy(), K[:, 2 * N_S :].T.copy()))
         closed = np.linalg.eigvals(A + B @ K)
         cases = [
             (a, r)

@@ -14,8 +14,9 @@ from mpi4py import MPI
 import softgrasp as sg
 from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.accuracy.adapt import estimated
-from softgrasp.fem.accuracy.estimate import cell_products, difference, estimate, indicators, next_order, prolong
+from softgrasp.fem.accuracy.estimate import cell_products, difference, estimate, indicators, next_order
 from softgrasp.fem.accuracy.krylov import krylov_model
+from softgrasp.fem.accuracy.surplus import prolong
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import times_columns, total

@@ -12,7 +12,7 @@ from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import box_simplices, check_memory, free_bytes, need
-from softgrasp.fem.strain.body import Body
+from softgrasp.fem.strain.body import HyperelasticBody
 from tests.helpers.models import CUBE, make_scene
 
 GIB = 2.0**30
@@ -111,7 +111,7 @@ def test_finite_strain_counts_its_matrices(order: int) -> None:
     model = build(make_scene(tissue=tissue, effects={"finite_strain": {}}), comm=MPI.COMM_SELF)
     system, cells = model.system, box_simplices([16, 32])
     assert system.points is not None
-    body = Body(system.points, system.materials)
+    body = HyperelasticBody(system.points, system.materials)
     body.tangent(system.K_ee.createVecRight())
     matrices = (body.points.B, body.A, body.K, body.product)
     held = 12 * sum(A.getInfo()["nz_used"] for A in matrices if A is not None)  # a number and a column each

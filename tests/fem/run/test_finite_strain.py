@@ -71,7 +71,7 @@ def test_energy_changes_by_the_work_of_the_load_alone(law: str, changes: dict[st
     assert run.energy_drift < 1e-9
     assert run.newton is not None
     assert 0.2 < run.newton.min_det < 1.0
-    assert run.newton.divided == 0
+    assert run.newton.substepped == 0
 
 
 @pytest.mark.serial
@@ -155,7 +155,7 @@ def test_stopped_run_goes_on_bit_by_bit(tmp_path_factory: pytest.TempPathFactory
 
 @pytest.mark.ranks
 @pytest.mark.parametrize("way", ["led", "led, two-way", "pushed"])
-def test_step_that_does_not_converge_is_divided(way: str) -> None:
+def test_step_that_does_not_converge_is_substepped(way: str) -> None:
     """Steps of more than a period under a violent motion; balances of energy and momentum hold over the parts too."""
     effects: dict[str, Any] = {
         "reaction": way != "led",
@@ -165,7 +165,7 @@ def test_step_that_does_not_converge_is_divided(way: str) -> None:
     force = (lambda n, t, q, v: 12 * wave(n, t, q, v)) if way == "pushed" else None
     run = simulate(model, force=force)
     assert run.newton is not None
-    assert run.newton.divided > 0
+    assert run.newton.substepped > 0
     assert run.energy_drift < 1e-9
     system, dt = model.system, model.scene.time_end / 6
     n = system.layout.n_local

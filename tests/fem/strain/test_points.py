@@ -15,7 +15,7 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.assembly import make_points
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import SAME, PETSc, to_scipy, total
-from softgrasp.fem.strain.body import Body
+from softgrasp.fem.strain.body import HyperelasticBody
 from softgrasp.fem.strain.laws import volume_change
 from softgrasp.fem.strain.points import whole_points
 from tests.helpers.models import (
@@ -89,7 +89,7 @@ def test_force_is_ffcx_s_and_tangent_its_derivative(changes: dict[str, Any], ord
     model = model_of(changes, order, law)
     system, comm = model.system, model.system.layout.comm
     assert system.points is not None
-    body = Body(system.points, system.materials, system.K_ee)
+    body = HyperelasticBody(system.points, system.materials, system.K_ee)
     volume = np.prod(model.scene.tissue.size) * model.scene.tissue.thickness  # type: ignore[arg-type]
     assert system.points.vol.min() > 0
     assert total(comm, np.array([system.points.vol.sum()]))[0] == pytest.approx(volume, rel=1e-13)
@@ -156,7 +156,7 @@ def test_force_is_scikit_fem_s(changes: dict[str, Any]) -> None:
     expected = np.zeros_like(z).reshape(-1, d)
     expected[at[at >= 0], component[at >= 0]] = full[at >= 0]
     f = vector(model, local_rows(layout, z))
-    Body(system.points, system.materials).force(vector(model, local_rows(layout, z)), f)  # type: ignore[arg-type]
+    HyperelasticBody(system.points, system.materials).force(vector(model, local_rows(layout, z)), f)  # type: ignore[arg-type]
     assert close(gather_rows(layout, f.array_r), expected.ravel()) < 1e-13
 
 
@@ -168,20 +168,20 @@ def test_layers_have_their_materials_and_all_points_stand_on_every_rank() -> Non
     )
     for one in (model, model.with_materials(lam=33.0)):
         system = one.system
-        body = Body(system.points, system.materials)  # type: ignore[arg-type]
+        body = HyperelasticBody(system.points, system.materials)  # type: ignore[arg-type]
         K = body.tangent(vector(one, np.zeros(system.layout.n_local)))
         assert close(gather_matrix(system.layout, K), gather_matrix(system.layout, system.K_ee)) < 1e-14
     layout = model.system.layout
     z = bent(model)
     f = vector(model, z)
     system = model.system
-    Body(system.points, system.materials).force(vector(model, z), f)  # type: ignore[arg-type]
+    HyperelasticBody(system.points, system.materials).force(vector(model, z), f)  # type: ignore[arg-type]
     order = np.random.default_rng(0).permutation(layout.n_e)
     whole = whole_points(system.points, layout.comm, order)  # type: ignore[arg-type]
     every = np.concatenate(layout.comm.allgather(z))
     u = PETSc.Vec().createWithArray(every[order].copy(), comm=MPI.COMM_SELF)
     g = u.duplicate()
-    Body(whole, system.materials).force(u, g)
+    HyperelasticBody(whole, system.materials).force(u, g)
     result = np.empty_like(every)
     result[order] = g.array_r
     assert close(result[layout.start : layout.start + layout.n_local], f.array_r) < 1e-13
@@ -193,7 +193,7 @@ def test_compiled_force_is_numpy_s(changes: dict[str, Any], order: int, law: str
     """One pass over the nodes against products with B: rounding of the sums, also where layers and a tail differ."""
     layers = {} if changes is CUBE else {k: {n: x for n, x in v.items() if n != "beta"} for k, v in LAYERS.items()}
     model = model_of(changes, order, law, tissue={"layers": layers})
-    body, plain = (Body(model.system.points, model.system.materials) for _ in range(2))  # type: ignore[arg-type]
+    body, plain = (HyperelasticBody(model.system.points, model.system.materials) for _ in range(2))  # type: ignore[arg-type]
     if body.kernel is None:
         pytest.skip("no C compiler")
     plain.kernel = None
@@ -252,7 +252,7 @@ def test_patch_of_an_irregular_mesh_has_one_stress(changes: dict[str, Any], side
     H += np.outer(a, normal)
     materials = model.scene.tissue.material
     P = closed_form(law, np.eye(d) + H, materials.lam, materials.mu)
-    body, f = Body(points, model.system.materials), z.duplicate()
+    body, f = HyperelasticBody(points, model.system.materials), z.duplicate()
     h = body.gradient(z).copy()
     assert np.abs(h - H[:, :, None]).max(initial=0.0) < 1e-13
     assert np.abs(points.laws.stress(h, body.lam, body.mu) - P[:, :, None]).max(initial=0.0) < 1e-12 * np.abs(P).max()

@@ -64,7 +64,7 @@ def test_divided_steps_obey_the_law_too(reaction: bool) -> None:
     target = [160.0, 80.0]
     found, _, run, problem = loops(plant(reaction=reaction), target, dt=0.5, steps=6)
     assert run.newton is not None
-    assert run.newton.divided > 0
+    assert run.newton.substepped > 0
     assert law_missed(found.gain, run, problem, target) < 1e-7  # the parts' load is right to 1e-10
 
 

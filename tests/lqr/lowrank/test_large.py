@@ -16,7 +16,7 @@ from softgrasp.fem.errors import CheckpointError, ResourceError, SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.design.scene import problem as make_problem
-from softgrasp.lqr.lowrank.adjoint import Right
+from softgrasp.lqr.lowrank.adjoint import AdjointRhs
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import Iteration, NewtonADI, load_state
 from softgrasp.lqr.lowrank.plant import Plant
@@ -256,7 +256,7 @@ def test_every_damage_of_a_restart_file_of_newton_is_refused(comm: MPI.Intracomm
                 path.write_bytes(bad)
             comm.Barrier()
             with pytest.raises(CheckpointError, match=rf"{path.name} .*remove the folder"):
-                load_state(folder, plant, Iteration(Right(nothing, nothing)), 1e-10)
+                load_state(folder, plant, Iteration(AdjointRhs(nothing, nothing)), 1e-10)
         comm.Barrier()
         if comm.rank == 0:
             path.write_bytes(good)

@@ -14,7 +14,7 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.dense.modal import relative_space
-from softgrasp.lqr.lowrank.adjoint import closed_adjoint, make_right
+from softgrasp.lqr.lowrank.adjoint import adjoint_rhs, closed_adjoint
 from softgrasp.lqr.lowrank.compress import compress
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin, frequencies
 from softgrasp.lqr.lowrank.modal_start import modal_start, plant_modes
@@ -43,7 +43,7 @@ def test_shifted_adjoint_solve_is_the_dense_one(name: str, tissue: str) -> None:
     below = slice(own.start + layout.n_e, own.stop + layout.n_e)
     local = Block(full[: 2 * s], np.vstack([full[own], full[below]]))
     solver = make_shifted(plant.system, tissue)
-    right = make_right(plant, solver, local)
+    right = adjoint_rhs(plant, solver, local)
     K_full, W_full = full[:, :2].T, full[:, 2:]
     for p in (-0.7, -0.3 + 4.0j, -2.0 + 30.0j):
         solution = closed_adjoint(plant, solver, p, right)

@@ -15,7 +15,7 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import times_columns, total
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
-from softgrasp.fem.strain.body import Body
+from softgrasp.fem.strain.body import HyperelasticBody
 from softgrasp.reduction.archive import load, save
 from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.bases.states import BasisError
@@ -51,7 +51,7 @@ def test_all_weights_one_is_the_projected_body(trained: Training) -> None:
     system, comm = trained.model.system, trained.model.system.layout.comm
     assert system.points is not None
     potential = Potential(trained.cells, system.materials, comm)
-    body = Body(system.points, system.materials)
+    body = HyperelasticBody(system.points, system.materials)
     z, f = system.K_ee.createVecs()
     for a in trained.references[0].a[[30, 70]]:
         z.array_w[:] = trained.Phi @ a

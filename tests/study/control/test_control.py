@@ -233,6 +233,7 @@ def refused(name: str, out: Path, *overrides: str) -> str:
     console = Console(file=io.StringIO(), quiet=MPI.COMM_WORLD.rank != 0)
     with pytest.raises(SoftgraspError) as caught:
         run_control(SCENES / f"{name}.toml", out, [*SMALL, *overrides], console, quiet=True, pictures=False)
+    MPI.COMM_WORLD.Barrier()  # rank 0 gives the folder back
     assert not out.exists()  # nothing half-written
     return str(caught.value)
 
@@ -289,6 +290,7 @@ def test_an_unstable_sampled_loop_writes_nothing_and_names_a_rate(tmp_path: Path
     out = common(tmp_path) / "out"
     with pytest.raises(SoftgraspError) as caught:
         quietly(out, *FAST, "time.steps=50", HELD.format(rate=5.0))
+    MPI.COMM_WORLD.Barrier()  # rank 0 gives the folder back
     assert not out.exists()
     sentence = str(caught.value)
     assert "at 5 Hz and one tick late is unstable" in sentence

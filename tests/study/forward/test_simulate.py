@@ -103,10 +103,10 @@ def test_results_are_written_before_the_estimate(
 ) -> None:
     """An estimate that ends the program leaves result and trajectory; one that fails also page and sentence."""
 
-    def ends(_: Model) -> NoReturn:
+    def ends(_: Model, **how: Any) -> NoReturn:
         raise RuntimeError("no estimate")
 
-    def fails(_: Model) -> NoReturn:
+    def fails(_: Model, **how: Any) -> NoReturn:
         raise np.linalg.LinAlgError("not definite")
 
     ended, failed = mpi_tmp_path / "ended", mpi_tmp_path / "failed"

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from rich.console import Console
+from scipy.interpolate import CubicSpline
 
 from softgrasp.fem.errors import Interrupted, SceneError
 from softgrasp.fem.fields.probe import make_probe
@@ -124,8 +125,9 @@ def setting_of(row: dict[str, Any]) -> Setting:
 
 
 def apart(values: Array, true: Array) -> float:
-    every = (len(true) - 1) // (len(values) - 1)
-    return float(np.linalg.norm(values - true[::every], axis=1).max() / np.linalg.norm(true, axis=1).max())
+    # a cubic spline between 512 steps adds less than 2e-7 (measured with 256): an answer may take any number of steps
+    there = CubicSpline(np.linspace(0, 1, len(true)), true)(np.linspace(0, 1, len(values)))
+    return float(np.linalg.norm(values - there, axis=1).max() / np.linalg.norm(true, axis=1).max())
 
 
 # --- the promise
@@ -323,7 +325,7 @@ def test_killed_command_goes_on_to_the_same_table(comm: MPI.Intracomm, result: d
     """The real command, with the limits of these tests, is killed in the middle, without a chance to clean up."""
     file, cache = write_scene(comm, tmp_path, make_scene(SMALL)), tmp_path / "cache"
     limits = f"m.POINT_WORK[2], m.GOALS[2], t.FINEST[2], t.WORK[2] = {WORK}, {GOALS}, {FINEST}, {2 * WORK}"
-    rooms = "from softgrasp.study.precision import settings as m, truth as t"
+    rooms = "from softgrasp.study.precision import reference as t, settings as m"
     code = f"{rooms}; {limits}; from softgrasp.study.cli import main; main()"
     command = [sys.executable, "-c", code, "study", str(file), "--out", str(tmp_path), "--question", "forward"]
     with subprocess.Popen(command, cwd=Path(__file__).parents[3], stdout=subprocess.DEVNULL) as process:
