@@ -80,8 +80,8 @@ def estimated_error(problem: StrainProblem, gram: Array, load: Array, weight: Ar
         E[i + 1] = state[:K]
     whole = E.copy()
     whole[:, :k] += a[edges]
-    off, size = (float(np.vdot(x, x @ gram)) for x in (E, whole))
-    return (off / size) ** 0.5 if size > 0 else 0.0
+    error, size = (float(np.vdot(x, x @ gram)) for x in (E, whole))
+    return (error / size) ** 0.5 if size > 0 else 0.0
 
 
 def _edges(steps: int, dt: float, K: Array) -> np.ndarray:
