@@ -26,7 +26,7 @@ from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.reduction.certified.archive import load_certified, save_certified
-from softgrasp.reduction.certified.model import Box, CertifiedModel
+from softgrasp.reduction.certified.model import CertifiedModel, ParameterDomain
 from softgrasp.reduction.certified.motion import Materials
 from softgrasp.reduction.certified.training import certified_model
 from softgrasp.reduction.certified.validation import true_error
@@ -61,7 +61,7 @@ def made(name: str, folder: Path) -> tuple[Model, CertifiedModel, Path]:
     (folder / "scene.toml").write_text(shipped_scenes()["paper_forward"].read_text().replace("target", "# target"))
     overrides = ["motion.target=[5, 3]"] * ("table" not in name)
     model = build(load_scene(folder / "scene.toml", [*overrides, *SCENES[name]]), comm=MPI.COMM_SELF)
-    box, (k, k2, duals) = Box((30.0, 500.0), (20.0, 500.0)), MODES[name in ("kelvin-voigt", "falling")]
+    box, (k, k2, duals) = ParameterDomain((30.0, 500.0), (20.0, 500.0)), MODES[name in ("kelvin-voigt", "falling")]
     Phi, places = lowest_modes(model.system, k2)[1], [materials_at(model, x, y) for x in box.lam for y in box.mu]
     save_certified(certified_model(model, Phi, k=k, box=box, places=places * duals), folder / f"{name}.h5")
     return model, load_certified(folder / f"{name}.h5", model.system.layout), folder / f"{name}.h5"
