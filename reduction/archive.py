@@ -221,7 +221,7 @@ def reading(
                     raise ModelError(f"{path} was made for another scene (hash {other}); reduce the scene again")
                 yield file, about
         except DAMAGE as error:
-            reason = f"{error} is missing" if isinstance(error, KeyError) else error
+            reason = f"{error} is missing" if isinstance(error, KeyError) else getattr(error, "strerror", None) or error
             raise ModelError(f"{path} cannot be read as a reduced model ({reason}); reduce the scene again") from error
 
 

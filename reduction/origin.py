@@ -25,6 +25,7 @@ FREE = re.compile(
 )
 MATERIAL = re.compile(r"tissue\.(layers\.[^.]+\.)?material\b|tissue\.layers\.[^.]+\.beta|effects\.damping\.(kind|beta)")
 MOTION = re.compile(r"(motion|time)\b")
+BEFORE, AFTER = 20, 30  # letters before and after the first that differs between two long values
 UNKNOWN = (
     "does not hold what it was built from (it is of an earlier version), so its gravity, contact, mesh and outputs are "
     "not compared with those of the scene; reduce the scene again"
@@ -48,15 +49,19 @@ def differing(own: Origin, other: Origin, free: tuple[re.Pattern[str], ...]) -> 
     """The first key, but for ``free`` ones, that differs between two origins, with both values; empty if none does."""
     for key in [*own, *(key for key in other if key not in own)]:
         if own.get(key) != other.get(key) and not any(pattern.match(key) for pattern in free):
-            mine = f"with {key} = {_text(key, own[key])}" if key in own else f"without {key}"
-            return f"{mine}, and the scene has {_text(key, other[key]) if key in other else 'none'}"
+            texts = [_text(key, where[key]) if key in where else "" for where in (own, other)]
+            same = next((i for i, (a, b) in enumerate(zip(*texts, strict=False)) if a != b), 0)
+            if same > BEFORE and max(map(len, texts)) > BEFORE + AFTER:  # what differs must be within what is shown
+                texts = [f"...{text[same - BEFORE :]}" for text in texts]
+            mine, its = map(shortened, texts)
+            return f"{f'with {key} = {mine}' if mine else f'without {key}'}, and the scene has {its or 'none'}"
     return ""
 
 
 def _text(key: str, value: Any) -> str:
     if key in ("tissue.mesh", "motion.csv"):
         return f"the file of hash {value[:12]}"
-    return shortened(json.dumps(value))
+    return json.dumps(value)
 
 
 def check_origin(origin: Origin, keys: Mapping[str, Any], name: str) -> None:

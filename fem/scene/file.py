@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import os
 import re
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -59,7 +60,8 @@ def shipped_scenes() -> dict[str, Path]:
 def find_scene(path: str | Path) -> Path:
     """The scene that ships under a bare name, else the file of that path."""
     file = Path(path)
-    return shipped_scenes().get(file.name, file) if len(file.parts) == 1 and not file.exists() else file
+    bare = len(file.parts) == 1 and not os.path.exists(file)  # false for a name that is too long, which Path raises
+    return shipped_scenes().get(file.name, file) if bare else file
 
 
 def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
@@ -130,7 +132,7 @@ def _apply(data: dict[str, Any], override: str) -> None:
     key, equals, text = (part.strip() for part in override.partition("="))
     parts = key.split(".")
     if not equals or not text or not all(parts):
-        raise SceneError(f"--set {override}: it must read section.key=value")
+        raise SceneError(f"--set {shortened(override)}: it must read section.key=value")
     node: Any = data
     for done, part in enumerate(parts[:-1], start=1):
         node = _child(node, part, override, ".".join(parts[:done]))
@@ -144,13 +146,13 @@ def _apply(data: dict[str, Any], override: str) -> None:
 def _child(node: Any, part: str, override: str, path: str) -> Any:
     child = node[_index(node, part, override)] if isinstance(node, list) else node.setdefault(part, {})
     if not isinstance(child, dict | list):
-        raise SceneError(f"--set {override}: {path} is {child!r}, no table; set {path} itself")
+        raise SceneError(f"--set {shortened(override)}: {path} is {_show(child)}, no table; set {path} itself")
     return child
 
 
 def _index(node: list[Any], part: str, override: str) -> int:
     if not part.isdecimal() or len(part) > 9 or int(part) >= len(node):
-        raise SceneError(f"--set {override}: '{part}' must be an index below {len(node)}")
+        raise SceneError(f"--set {shortened(override)}: '{shortened(part)}' must be an index below {len(node)}")
     return int(part)
 
 
@@ -160,12 +162,12 @@ def _parse(text: str, override: str) -> Any:
     except tomllib.TOMLDecodeError:
         if re.fullmatch(r"[A-Za-z_./~][A-Za-z0-9_./~+-]*", text):  # the shell ate the quotes
             return text
-        form = f"write [{text}]" if re.fullmatch(r"[^,\[\]]+(,[^,\[\]]+)+", text) else "a text is '\"...\"'"
-        raise SceneError(f"--set {override}: '{text}' is not a TOML value; {form}") from None
+        form = f"write [{shortened(text)}]" if re.fullmatch(r"[^,\[\]]+(,[^,\[\]]+)+", text) else "a text is '\"...\"'"
+        raise SceneError(f"--set {shortened(override)}: '{shortened(text)}' is not a TOML value; {form}") from None
     except ValueError as error:
-        raise SceneError(f"--set {override}: it {error}") from None
+        raise SceneError(f"--set {shortened(override)}: it {error}") from None
     if table.keys() != {"value"}:
-        raise SceneError(f"--set {override}: it must hold one value")
+        raise SceneError(f"--set {shortened(override)}: it must hold one value")
     return table["value"]
 
 
@@ -177,9 +179,9 @@ def _explain(error: ValidationError, data: dict[str, Any]) -> str:
     problems: dict[str, str] = {}
     misspelled, missing = [], []
     for item in error.errors(include_url=False):
-        path, value = _locate(item["loc"], data)
-        dotted = ".".join(path)
         kind, message = item["type"], item["msg"]
+        path, value = _locate(item["loc"], data, kind)
+        dotted = ".".join(path)
         if kind == "extra_forbidden":
             text = f"{dotted} is not a key; {_suggest(path)}"
             misspelled.append(text)
@@ -212,11 +214,11 @@ def _show(value: Any) -> str:
     return shortened(toml_value(value) if isinstance(value, dict | list | str | bool | int | float) else str(value))
 
 
-def _locate(loc: tuple[int | str, ...], data: Any) -> tuple[list[str], Any]:
+def _locate(loc: tuple[int | str, ...], data: Any, kind: str) -> tuple[list[str], Any]:
     """Path and value of an error; names of union branches, which are no keys, drop out."""
     path: list[str] = []
     for part in loc:
-        if isinstance(data, dict):
+        if isinstance(data, dict) and (part in data or kind == "missing"):
             path.append(str(part))
             data = data.get(part)
         elif isinstance(data, list) and isinstance(part, int):

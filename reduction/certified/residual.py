@@ -38,11 +38,11 @@ MARGIN = 1.01  # of the largest frequency, which the iteration meets from below
 class ResidualNorms:
     """Triangles of the columns [G_1 of every layer; M_1 phi, K_mu phi, K_lambda phi of every layer, mode by mode]."""
 
-    static: Array  # in K_r^-1, (rows, L n_s + 3 L k)
-    mass: Array  # in M_r^-1, alike
-    reference: tuple[LayerMaterial, ...]  # materials of K_r and M_r
-    n_s: int  # degrees of freedom of the hand
-    dimension: int  # of space
+    static: Array  # triangle T of the columns in K_r^-1, (rows, L n_s + 3 L k)
+    mass: Array  # triangle T of the columns in M_r^-1, (rows, L n_s + 3 L k)
+    reference: tuple[LayerMaterial, ...]  # material of each of the L layers in K_r and M_r
+    n_s: int  # number of degrees of freedom of the hand [1]
+    dimension: int  # space dimension d
     omega: tuple[float, float]  # lowest and (a bound on the) highest frequency at the reference [1/s]
     # triangle of the modes in K_r, and of [modes, those of the velocity] in M_r, for models whose kinematics are not
     # exact; else None

@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.effects import EFFECTS, Gate
 from softgrasp.fem.effects.gate import SMALL_SHARE, Sag
+from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.mesh.singular import expected_order
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.memory import Need, factor_bytes, need, solver_of
@@ -28,7 +29,8 @@ from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.files import to_json
 
 MODES = 6
-ESTIMATE_SECONDS = 0.5  # a dearer estimate of the mesh is left to simulate
+MOST_LOOKED_AT = {2: 20_000, 3: 6_000}  # unknowns that modes and sag are computed on
+ESTIMATE_SECONDS = 1.0  # a dearer estimate of the mesh is left to simulate
 LARGE = 200_000  # cells beyond which rank 0 does not look for the ends
 
 
@@ -81,6 +83,7 @@ class MeshReport:
     order: float  # expected order of the outputs in n_e^(1/d) d/2, that is in the cell size h on even meshes [1]
     graded: bool  # whether cells shrink towards the ends
     first: bool  # whether a run may refine this mesh further
+    coarser: bool  # whether the estimate is that of coarser cells, so that the error is about as large or less
     # estimate, bound: relative error of the deformation [1]; None where the estimate takes long
     estimate: float | None
     bound: float | None
@@ -109,6 +112,7 @@ class Explanation:
     snapshot_columns: int
     snapshot_bytes: int
     mesh: MeshReport  # singular ends, and the error they leave
+    coarser: int  # unknowns of the coarser copy of a large mesh that gives modes, sag and estimate [1]; 0: none
     dimension: int  # 2 or 3
 
     def to_dict(self) -> dict[str, Any]:
@@ -129,11 +133,13 @@ def explain_model(model: Model) -> Explanation:
     d, ranks = layout.dimension, layout.comm.size
     name, reason = solver_of(scene, layout)
     copies = ranks if factor_on_every_rank(layout, name, scene.time.reproducible) else 1
-    if layout.n_e <= DIRECT_LIMIT[d]:  # the modes need a factor
-        omega, Phi = lowest_modes(system, min(MODES, layout.n_e))
+    looked = coarser_copy(model)
+    small = looked.system
+    if small.layout.n_e <= DIRECT_LIMIT[d]:  # the modes need a factor
+        omega, Phi = lowest_modes(small, min(MODES, small.layout.n_e))
     else:
-        omega, Phi = np.zeros(0), np.zeros((layout.n_local, 0))
-    problem = measure(model, omega, Phi, largest_acceleration(scene, layout.n_s, system.M_hand))
+        omega, Phi = np.zeros(0), np.zeros((small.layout.n_local, 0))
+    problem = measure(looked, omega, Phi, largest_acceleration(scene, layout.n_s, system.M_hand))
     reports = {
         key: EffectReport(e.active(scene), e.term, e.operators(scene), e.cost, e.gate(problem))
         for key, e in EFFECTS.items()
@@ -168,13 +174,30 @@ def explain_model(model: Model) -> Explanation:
         memory=need(scene, d, sizes.cells, layout.comm, run=True),
         snapshot_columns=columns,
         snapshot_bytes=16 * layout.n_e * columns,
-        mesh=mesh_report(model),
+        mesh=mesh_report(model, looked),
+        coarser=0 if looked is model else small.layout.n_e,
         dimension=d,
     )
 
 
-def mesh_report(model: Model) -> MeshReport:
-    """Look for singular ends and estimate the error. Collective."""
+def coarser_copy(model: Model) -> Model:
+    """The scene of a large box on fewer cells, for numbers of two digits; else the model itself. Collective."""
+    scene, layout = model.scene, model.system.layout
+    tissue, most = scene.tissue, MOST_LOOKED_AT[layout.dimension]
+    adaptive = tissue.refine is not None and tissue.refine.tolerance is not None
+    if tissue.cells is None or adaptive or layout.n_e <= most:
+        return model
+    ratio = (most / layout.n_e) ** (1 / layout.dimension)
+    cells = [max(int(ratio * n), 1) for n in tissue.cells]
+    other = scene.model_copy(update={"tissue": tissue.model_copy(update={"cells": cells})})
+    try:
+        return build(other, comm=layout.comm, run=False)
+    except (MeshError, SceneError):  # cells so large miss the contact zone or a layer
+        return model
+
+
+def mesh_report(model: Model, looked: Model) -> MeshReport:
+    """Look for singular ends and estimate the error, that of a coarser copy where the mesh takes long. Collective."""
     scene, tissue = model.scene, model.space.mesh
     refine = scene.tissue.refine
     small = tissue.mesh.topology.index_map(tissue.dimension).size_global <= LARGE
@@ -186,9 +209,12 @@ def mesh_report(model: Model) -> MeshReport:
     edges = graded and tissue.dimension == 3 and not by_lines(scene)
     order = 2.0 * scene.tissue.order if ends is None else expected_order(ends, scene.tissue.order, graded, edges)
     error = estimate_error(model, ESTIMATE_SECONDS)[0]
+    if error is None and looked is not model:
+        error = estimate_error(looked, ESTIMATE_SECONDS)[0]
+    coarse = error is not None and (error.by == "coarser" or error.n_e != model.system.layout.n_e)
     values = (None,) * 4 if error is None else (error.estimate, error.bound, error.time_error, error.shift)
     first = refine is not None and refine.tolerance is not None and refine.passes > 0
-    return MeshReport(kinds, order, graded, first, *values)
+    return MeshReport(kinds, order, graded, first, coarse, *values)
 
 
 def _warnings(

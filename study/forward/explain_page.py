@@ -90,13 +90,17 @@ def sections(result: Explanation) -> list[Section]:
     costs = [(name, e.term, ", ".join(e.operators) or "nothing", e.cost) for name, e in result.effects.items() if e.on]
     periods = [(k, w, T, t.dt / T) for k, (w, T) in enumerate(zip(t.omega, t.periods, strict=True), 1)]
     modes = ("mode", "omega [1/s]", "period [s]", "dt / period")
+    text = (
+        f"Modes, sag and what follows from them are those of the same scene on coarser cells, n_e = {result.coarser}."
+    )
+    copied = [text] if result.coarser else []
     no_modes = "" if periods else "Not computed: the factor would not fit."
     return [
         Section("Warnings", text="\n\n".join(remarks(result)) or "Nothing stands out."),
         Section(EQUATION, code="\n".join(result.equation.plain().lines()), equation=result.equation),
         Section("Sizes", rows=sizes),
         Section("At rest under its weight, the hand held still", rows=sag_rows(result)),
-        Section("Mesh", text="\n\n".join(mesh_lines(result.mesh, result.dimension))),
+        Section("Mesh", text="\n\n".join([*copied, *mesh_lines(result.mesh, result.dimension)])),
         Section("Effects", header=EFFECTS, rows=effects),
         *([Section("What is on", header=COSTS, rows=costs)] if costs else []),
         Section("First modes of the clamped tissue", no_modes, header=modes if periods else (), rows=periods),
@@ -149,7 +153,9 @@ def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
         lines.append("This is the first mesh: simulate may refine it further, to meet tissue.refine.tolerance.")
     if report.estimate is not None and report.bound is not None and report.time_error is not None:
         lines.append(
-            f"The deformation is about {percent(report.estimate)} off on this mesh (bound {percent(report.bound)}) and "
+            f"The deformation is about {percent(report.estimate)} "
+            f"{'or less off, as estimated on coarser cells' if report.coarser else 'off on this mesh'} "
+            f"(bound {percent(report.bound)}) and "
             f"about {percent(report.time_error)} by the time step."
         )
     else:

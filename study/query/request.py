@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem.errors import SceneError, shortened
 from softgrasp.fem.model.memory import size_text
 from softgrasp.fem.resources import free_memory
 from softgrasp.fem.run.motion import Profile, read_csv
@@ -33,10 +33,12 @@ def parse_settings(settings: Sequence[str]) -> dict[str, float]:
         if not equals or key not in KEYS:
             near = difflib.get_close_matches(key, KEYS, n=1)
             hint = f"did you mean {near[0]}?" if near else "a query sets lambda, mu or rho, for example --set lambda=77"
-            raise SceneError(f"--set {text}: {hint}")
+            raise SceneError(f"--set {shortened(text)}: {hint}")
         if key in numbers:
-            raise SceneError(f"--set {text}: {key} is set twice; give one value, or many in a table with --batch")
-        numbers[key] = _number(value, f"--set {text}")
+            raise SceneError(
+                f"--set {shortened(text)}: {key} is set twice; give one value, or many in a table with --batch"
+            )
+        numbers[key] = _number(value, f"--set {shortened(text)}")
     return numbers
 
 
@@ -44,7 +46,7 @@ def _number(text: str, where: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise SceneError(f"{where}: '{text}' is not a number") from None
+        raise SceneError(f"{where}: '{shortened(text)}' is not a number") from None
     if not math.isfinite(value) or out_of_range(value):
         raise SceneError(f"{where}: give a finite number between 1e-50 and 1e50")
     return value
@@ -60,7 +62,7 @@ def read_batch(path: Path) -> list[dict[str, float]]:
         raise SceneError(f"--batch {path}: {error}") from error
     header = [name.split("[")[0].strip() for name in lines[0]] if lines else []
     if not header or set(header) - set(KEYS) or len(set(header)) < len(header):
-        names = ", ".join(header) or "nothing"
+        names = shortened(", ".join(header)) or "nothing"
         raise SceneError(f"--batch {path}: the first line must name columns (lambda, mu, rho or some); it has {names}")
     rows = []
     for i, line in enumerate(lines[1:], 1):

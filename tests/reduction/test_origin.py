@@ -18,6 +18,7 @@ from softgrasp.reduction.archive import write_checksums
 from softgrasp.reduction.certified.archive import save_certified
 from softgrasp.reduction.certified.training import certified_model
 from softgrasp.reduction.model import ModelError, ReducedModel
+from softgrasp.reduction.origin import differing
 from softgrasp.reduction.strain.model import StrainModel
 
 BASE = (
@@ -134,3 +135,23 @@ def test_a_file_of_an_earlier_version_is_read_and_says_what_it_lacks(folder: Pat
     with pytest.warns(RuntimeWarning, match="does not hold what it was built from"):
         found = sg.replay(sg.load(path), model, run)
     assert np.array_equal(found.outputs, sg.replay(reduced(kind, folder), model, run).outputs)
+
+
+@pytest.mark.serial
+def test_what_differs_stands_in_the_sentence_of_long_values() -> None:
+    """Two lists of outputs with one beginning of 180 letters."""
+    first = [{"kind": "node", "point": [0.5, x], "name": f"the point {x}"} for x in (0.0, 1.0, 2.0)]
+    second = [*first[:2], first[2] | {"name": "top"}]
+    said = differing({"control.outputs": first}, {"control.outputs": second}, ())
+    assert '"the point 2.0"' in said
+    assert '"top"' in said
+    assert len(said) < 200
+    assert differing({"a": 1}, {"b": "x" * 500}, ()) == "with a = 1, and the scene has none"
+    assert "x" * 50 in differing({}, {"b": "x" * 500}, ())
+    assert "x" * 61 not in differing({}, {"b": "x" * 500}, ())
+
+
+@pytest.mark.serial
+def test_a_model_file_that_is_missing_is_named_without_errno(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"none\.h5 cannot be read as a reduced model \(No such file or directory\)"):
+        sg.load(tmp_path / "none.h5")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -66,6 +67,35 @@ def test_no_value_of_a_key_ends_in_a_traceback(key: str) -> None:
 )
 def test_no_key_ends_in_a_traceback(change: str) -> None:
     sentence(lambda: load_scene(PAPER, [change]))
+
+
+@pytest.mark.parametrize(
+    "key", [*KEYS, "hand." + "m" * 5000, "time.steps." + "m" * 5000, "control.outputs." + "8" * 5000]
+)
+def test_no_sentence_repeats_what_is_long(key: str) -> None:
+    """Of a value 60 letters, of a name of a key 80: more hides what is wrong."""
+    for value in ("9" * 5000, "x" * 5000, "[" + "1," * 5000 + "]", "'" + "x" * 5000 + "'"):
+        try:
+            load_scene(PAPER, [f"{key}={value}"])
+        except SceneError as error:
+            text = str(error)
+        else:
+            assert key in ("description", "reduction.N")  # which take a long text and a long list
+            continue
+        assert not re.search(r"9{61}|x{61}|8{61}|m{81}|(1, ?){31}", text)
+
+
+@pytest.mark.parametrize("key", [
+    "tissue.refine.grading", "contact.facet_tag", "hand.inertia", "control.Q", "control.R", "control.loop.limit",
+    "control.loop.delay", "reduction.train", "reduction.motions", "output.memory", "output.frames",
+])  # fmt: skip
+def test_a_table_where_one_of_several_types_belongs_is_named_by_its_key(key: str) -> None:
+    text = sentence(lambda: load_scene(PAPER, [f"{key}={{a = {{b = 1}}}}"]))
+    assert f"{key} is {{ a = {{ b = 1 }} }}; it must be " in text
+
+
+def test_a_name_that_no_file_can_have_is_refused() -> None:
+    assert "cannot be read" in sentence(lambda: load_scene("q" * 5000))
 
 
 FILES: dict[str, tuple[bytes, str]] = {

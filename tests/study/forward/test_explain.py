@@ -18,7 +18,7 @@ from softgrasp.fem.model.scales import gradient, slowest
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.scene.file import shipped_scenes
+from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
@@ -273,3 +273,28 @@ def test_text_and_json(comm: MPI.Intracomm) -> None:
 def test_only_rank_zero_writes(comm: MPI.Intracomm, capsys: pytest.CaptureFixture[str]) -> None:
     run_explain(shipped_scenes()["paper_forward"], None, ["tissue.cells=[3,6]"], console())
     assert ("n_e =" in capsys.readouterr().out) == (comm.rank == 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "cells"),
+    [
+        ("paper_forward", [], "tissue.cells=[100,200]"),
+        ("block_3d", ["tissue.order=1", "tissue.refine=false"], "tissue.cells=[12,12,24]"),
+    ],
+)
+def test_a_large_scene_is_explained_by_coarser_cells(
+    comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch, name: str, changes: list[str], cells: str
+) -> None:
+    """Modes and sag of the copy against those of the mesh itself, and the page says whose they are."""
+    scene = load_scene(name, [*changes, cells])
+    copied = explain(scene, comm)
+    monkeypatch.setattr("softgrasp.study.forward.explain.MOST_LOOKED_AT", {2: 10**7, 3: 10**7})
+    own = explain(scene, comm)
+    assert (own.coarser, copied.sizes.n_e) == (0, own.sizes.n_e)
+    assert 0 < copied.coarser <= {2: 20_000, 3: 6_000}[own.dimension]
+    off = {2: 0.05, 3: 0.35}[own.dimension]  # linear cells at nu = 0.49 lock: the mesh itself is a third off
+    assert copied.time.omega[0] == pytest.approx(own.time.omega[0], rel=off)
+    assert copied.sag.largest == pytest.approx(own.sag.largest, rel=2 * off)
+    said = io.StringIO()
+    render(copied, sections(copied), Console(file=said, width=300))
+    assert f"on coarser cells, n_e = {copied.coarser}" in said.getvalue()
