@@ -18,8 +18,8 @@ from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import Profile
 from softgrasp.reduction.archive import LINEAR, about, read_linear, reading, write_model, write_small
-from softgrasp.reduction.certified.certificate import MeshNumber
-from softgrasp.reduction.certified.model import Box, CertifiedModel
+from softgrasp.reduction.certified.certificate import OfflineMeshEstimate
+from softgrasp.reduction.certified.model import CertifiedModel, ParameterDomain
 from softgrasp.reduction.certified.motion import Drive
 from softgrasp.reduction.certified.residual import ResidualNorms
 from softgrasp.reduction.model import ModelError
@@ -43,13 +43,13 @@ def save_certified(model: CertifiedModel, path: str | Path) -> None:
 
 
 def _write(model: CertifiedModel, group: h5py.Group) -> None:
-    norms, mesh = model.norms, model.mesh
+    norms, mesh, box = model.norms, model.mesh, model.box
     data = {
         "k": model.k,
         "certify": model.certify,
         "tolerance": model.tolerance,
         "norm": model.norm,
-        "box": None if model.box is None else asdict(model.box),
+        "box": None if box is None else {"lam": box.lam, "mu": box.mu, "apart": box.independent_layers},
         "mesh": None if mesh is None else asdict(mesh),
         "reference": [asdict(m) for m in norms.reference],
         "n_s": norms.n_s,
@@ -121,9 +121,9 @@ def _about(data: dict[str, Any], static: Array, mass: Array, shape: tuple[Array,
     norms = ResidualNorms(static, mass, reference, data["n_s"], data["dimension"], (low, high), shape)
     mesh, box = data["mesh"], data["box"]
     if mesh is not None:
-        mesh = MeshNumber(tuple((a, b) for a, b in mesh["places"]), tuple(mesh["estimates"]))
+        mesh = OfflineMeshEstimate(tuple((a, b) for a, b in mesh["places"]), tuple(mesh["estimates"]))
     if box is not None:
-        box = Box(tuple(box["lam"]), tuple(box["mu"]), box["apart"])
+        box = ParameterDomain(tuple(box["lam"]), tuple(box["mu"]), box["apart"])
     kept = {key: data[key] for key in ("k", "certify", "tolerance", "norm", "training")}
     return {**kept, "norms": norms, "box": box, "mesh": mesh}
 

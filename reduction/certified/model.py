@@ -17,7 +17,13 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.certified import bounds
-from softgrasp.reduction.certified.certificate import Bound, Certificate, CertifiedRun, MeshNumber, ToleranceError
+from softgrasp.reduction.certified.certificate import (
+    Bound,
+    Certificate,
+    CertifiedRun,
+    OfflineMeshEstimate,
+    ToleranceError,
+)
 from softgrasp.reduction.certified.motion import (
     Drive,
     Materials,
@@ -38,15 +44,12 @@ TOGETHER = 4_000_000  # entries of the states of a batch that march at once: 32 
 
 
 @dataclass(frozen=True)
-class Box:
-    """Ranges of lambda and mu of the first layer [Pa], at its density in the projection.
+class ParameterDomain:
+    """Ranges of lambda and mu for which a model was trained, at the densities of the projection."""
 
-    The other layers keep their ratios to it, or, ``apart``, each has the same factors for itself.
-    """
-
-    lam: tuple[float, float]
-    mu: tuple[float, float]
-    apart: bool = False
+    lam: tuple[float, float]  # least and largest lambda of the first layer [Pa]
+    mu: tuple[float, float]  # least and largest mu of the first layer [Pa]
+    independent_layers: bool = False  # every layer varies by itself within these factors; else all keep their ratios
 
 
 @dataclass(frozen=True)
@@ -71,11 +74,11 @@ class CertifiedModel:
     k: int
     norms: ResidualNorms
     compliance: Array
-    box: Box | None = None
+    box: ParameterDomain | None = None
     tolerance: float | None = None
     certify: Certify = "two"
     norm: str = "energy"
-    mesh: MeshNumber | None = None
+    mesh: OfflineMeshEstimate | None = None
     drive: Drive | None = None
     training: dict[str, Any] = field(default_factory=dict)
 
@@ -121,7 +124,7 @@ class CertifiedModel:
             return True
         own, first = self.fine.materials, self.fine.materials[0]
         ratios = [(m.lam / o.lam, m.mu / o.mu, m.rho / o.rho) for m, o in zip(materials, own, strict=True)]
-        alike = slice(2 if self.box.apart else 0, 3)
+        alike = slice(2 if self.box.independent_layers else 0, 3)
         near = all(isclose(x, y) for r in ratios for x, y in list(zip(r, ratios[0], strict=True))[alike])
         near = near and all(isclose(m.beta, o.beta) for m, o in zip(materials, own, strict=True))
         limits = [
@@ -194,8 +197,8 @@ class CertifiedModel:
             for materials, answer, certificate in self._certified(many[at : at + chunk], drive, g):
                 if prove_time_step and drive.finer is not None and certificate.time_step is not None:
                     ((_, _, finer),) = self._certified([materials], replace(drive.finer, finer=None), g)
-                    off = certificate.energy.largest + finer.energy.largest
-                    proof = certificate.time_step + float(off) / certificate.energy.size
+                    both = certificate.energy.largest + finer.energy.largest
+                    proof = certificate.time_step + float(both) / certificate.energy.size
                     certificate = replace(certificate, time_step_proof=proof)
                 certificate = replace(certificate, tolerance=tolerance, mesh=self.mesh, norm=self.norm)
                 runs.append(CertifiedRun(answer.trajectory(drive.dt, self.fine.outputs.names), certificate))
@@ -240,13 +243,13 @@ class CertifiedModel:
         if self.certify == "estimate" and estimate is not None and wide is not None:
             return Certificate(estimate, wide, inside=inside)
         own = self._bound(fine, materials, drive)
-        reach = self._reach(own, materials, drive)
+        output_bound = self._output_bound(own, materials, drive)
         effectivity = np.inf
         if estimate is not None and estimate.largest > own.max():
             effectivity = float((estimate.largest + own.max()) / (estimate.largest - own.max()))
         return Certificate(
             energy=Bound(own if estimate is None else estimate.values + own, size, "proof"),
-            outputs=Bound(reach if wide is None else wide.values + reach, deformation, "proof"),
+            outputs=Bound(output_bound if wide is None else wide.values + output_bound, deformation, "proof"),
             estimate=estimate,
             outputs_estimate=wide,
             effectivity_at_most=effectivity,
@@ -285,7 +288,7 @@ class CertifiedModel:
         drift, gap, start = r.inexact or (None, None, 0.0)
         return bounds.static_bound(r.nodes, r.rest, drive.dt, drive.start == "equilibrium", kernel, drift, gap, start)
 
-    def _reach(self, bound: Array, materials: Materials, drive: Drive) -> Array:
+    def _output_bound(self, bound: Array, materials: Materials, drive: Drive) -> Array:
         """Bound of every output component from one of the energy, (steps + 1, p)."""
         reach = bound[:, None] * (self.norms.static_factor(materials) * self.compliance)
         if self._coupled(drive):
@@ -302,10 +305,10 @@ class CertifiedModel:
             return 0.0
         if finer.w is not None and answer.w is not None:
             d = finer.w[:, :, ::many] - answer.w
-            off = bounds.lengths(d.reshape(-1, d.shape[2]))
+            error = bounds.lengths(d.reshape(-1, d.shape[2]))
         else:
             x = finer.states(fine_drive.dt)[::many] - answer.states(drive.dt)
             if not self._coupled(drive):
                 x[:, : 2 * answer.q_s.shape[1]] = 0.0
-            off = self._energy(self.coarse, materials, x, drive)
-        return float(off.max() / answer.size * many**2 / (many**2 - 1))
+            error = self._energy(self.coarse, materials, x, drive)
+        return float(error.max() / answer.size * many**2 / (many**2 - 1))

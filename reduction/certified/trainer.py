@@ -19,13 +19,13 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
-from softgrasp.reduction.certified.certificate import MeshNumber
-from softgrasp.reduction.certified.greedy import REASONS, Greedy, Round, greedy, start
-from softgrasp.reduction.certified.model import Box, CertifiedModel
+from softgrasp.reduction.certified.certificate import OfflineMeshEstimate
+from softgrasp.reduction.certified.greedy import REASONS, Greedy, GreedyStep, greedy, start
+from softgrasp.reduction.certified.model import CertifiedModel, ParameterDomain
 from softgrasp.reduction.certified.motion import Materials
 from softgrasp.reduction.certified.residual import ResidualSpace
 from softgrasp.reduction.certified.training import certified_model, scene_drive
-from softgrasp.reduction.certified.validation import tested
+from softgrasp.reduction.certified.validation import measured_error
 from softgrasp.reduction.parameters import box_of, materials_at, outside, run_with, thinned
 
 COLUMNS = 200  # states of a full run that its modes are taken from
@@ -102,7 +102,7 @@ class Trainer:
         self.comm = model.system.layout.comm
         lam, mu = box_of(model)
         layers = model.scene.reduction.layers == "apart" and len(model.system.materials) > 1
-        self.box = Box((lam[0], lam[1]), (mu[0], mu[1]), layers)
+        self.box = ParameterDomain((lam[0], lam[1]), (mu[0], mu[1]), layers)
         count = model.scene.reduction.grid
         axis = np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
         draws = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 1, 2)
@@ -216,7 +216,7 @@ class Trainer:
 
     def random(self, n: int, seed: int) -> list[Materials]:
         """Random materials of the box, the same on every rank."""
-        width = len(self.model.system.materials) if self.box.apart else 1
+        width = len(self.model.system.materials) if self.box.independent_layers else 1
         return self.at(np.random.default_rng(seed).uniform(size=(n, width, 2)))
 
     def destroy(self) -> None:
@@ -235,7 +235,7 @@ def train_key(model: Model) -> str:
 
 def state_of(model: CertifiedModel) -> Greedy:
     """The greedy's state in a model that was saved on the way."""
-    rounds = tuple(Round(**entry) for entry in model.training["rounds"])
+    rounds = tuple(GreedyStep(**entry) for entry in model.training["rounds"])
     return Greedy(rounds, np.array(model.training["known"], dtype=float))
 
 
@@ -329,7 +329,7 @@ def within(trainer: Trainer, model: CertifiedModel, many: list[Materials], toler
     return True
 
 
-def mesh_number(model: Model, places: Sequence[Materials]) -> MeshNumber:
+def offline_mesh_estimate(model: Model, places: Sequence[Materials]) -> OfflineMeshEstimate:
     """Estimate of the error of the mesh at some parameters, relative to the deformation. Collective.
 
     Raises:
@@ -345,11 +345,11 @@ def mesh_number(model: Model, places: Sequence[Materials]) -> MeshNumber:
         systems = ((m, m.system.with_materials(place)) for m in (model, other))
         pair = [krylov_model(replace(m, system=system)) for m, system in systems]
         estimates.append(accuracy.difference(pair[0], pair[1])[0])
-    return MeshNumber(tuple((place[0].lam, place[0].mu) for place in places), tuple(estimates))
+    return OfflineMeshEstimate(tuple((place[0].lam, place[0].mu) for place in places), tuple(estimates))
 
 
 def validate(trainer: Trainer, model: CertifiedModel, n: int) -> Validation:
-    """Full runs at n random parameters: how far the estimate is off, and how sure that is. Collective.
+    """Full runs at n random parameters: error of the estimate, and its confidence. Collective.
 
     With c the largest ratio seen, the share of the box where the error exceeds c times the estimate is at most
     1 - 0.05^(1/n) with a confidence of 95 %.
@@ -357,6 +357,6 @@ def validate(trainer: Trainer, model: CertifiedModel, n: int) -> Validation:
     modes, tests = trainer.Phi[:, : model.k], []
     for place in trainer.random(n, SEED + 1):
         full = run_with(trainer.models[0], place)
-        tests.append(tested(full, model.run(place, trainer.drives[0], allow=True), modes))
+        tests.append(measured_error(full, model.run(place, trainer.drives[0], allow=True), modes))
     factor, worst = max(t.truth / t.estimate if t.estimate else np.inf for t in tests), max(t.truth for t in tests)
     return Validation(n, factor, worst, float(1 - 0.05 ** (1 / n)))

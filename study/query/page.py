@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from softgrasp.reduction.certified.certificate import Certificate
-from softgrasp.reduction.certified.model import Box
+from softgrasp.reduction.certified.model import ParameterDomain
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.page import Section, captioned, write_report
@@ -53,7 +53,7 @@ def write_page(out: Path, answers: QueryResult, line: str) -> list[Path]:
     return [*files, page]
 
 
-def box_text(box: Box) -> str:
+def box_text(box: ParameterDomain) -> str:
     """The box of the training in words."""
     return f"lambda {box.lam[0]:g} to {box.lam[1]:g} Pa, mu {box.mu[0]:g} to {box.mu[1]:g} Pa"
 

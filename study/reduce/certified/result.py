@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from softgrasp.reduction.certified.validation import Tested
+from softgrasp.reduction.certified.validation import TestError
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Size:
     k2: int
     N: int  # dimension of the answer
     query: float  # median seconds of an answer with its certificate
-    tested: tuple[Tested, ...]  # one a parameter
+    tested: tuple[TestError, ...]  # one a parameter
 
     def largest(self, key: str) -> float:
         """Over the tests."""

@@ -93,7 +93,7 @@ class BoxErrors:
 
 
 @dataclass(frozen=True)
-class BoxTests:
+class DomainTests:
     """All tests at other parameters."""
 
     models: tuple[TestedModel, ...] = ()  # tested
@@ -122,7 +122,7 @@ class ReductionStudy:
     full: FullRun  # the full run
     sweeps: tuple[MethodSweep, ...]  # every method
     times: FullTimes  # of the full model
-    box: BoxTests  # errors at other parameters
+    box: DomainTests  # errors at other parameters
     turns: Turns | None  # full model and the most accurate stable reduced one in turn; None without any
     findings: tuple[str, ...]  # what the numbers show, in sentences
     speed_notes: tuple[str, ...]  # what the times are measured against

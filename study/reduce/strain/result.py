@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from softgrasp.reduction.replay import FullRun
-from softgrasp.reduction.strain.model import StrainModel, TrainedBox
+from softgrasp.reduction.strain.model import StrainModel, TrainingDomain
 from softgrasp.study.reduce.times import FullTimes, Turns
 
 CELLS_AT = (14, 24)  # N at which tau is varied
@@ -59,7 +59,7 @@ class StrainFamily:
     """Models of all N from the same training runs."""
 
     key: str  # "own", the scene's run alone, or "box", runs at other materials and motions too
-    box: TrainedBox  # what they answer for
+    box: TrainingDomain  # what they answer for
     runs: int  # full runs that trained them
     points: tuple[StrainPoint, ...]  # with tau from the model on all cells, one for each N
     curves: tuple[StrainPoint, ...]  # those, and others of some N with given tau

@@ -26,7 +26,7 @@ from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.reduction.certified.archive import load_certified, save_certified
-from softgrasp.reduction.certified.model import Box, CertifiedModel
+from softgrasp.reduction.certified.model import CertifiedModel, ParameterDomain
 from softgrasp.reduction.certified.motion import Materials
 from softgrasp.reduction.certified.training import certified_model
 from softgrasp.reduction.certified.validation import true_error
@@ -52,7 +52,7 @@ KINDS = ("plain", "dt", "motion", "motion and dt", "batch", "batch and dt")
 def made(name: str, folder: Path) -> tuple[Model, CertifiedModel, Path]:
     """Scene, certified model as a query reads it from its file, and the file."""
     model = build(load_scene(shipped_scenes()["paper_forward"], SCENES[name]), comm=MPI.COMM_SELF)
-    box = Box((30.0, 500.0), (20.0, 500.0))
+    box = ParameterDomain((30.0, 500.0), (20.0, 500.0))
     save_certified(certified_model(model, lowest_modes(model.system, 30)[1], k=10, box=box), folder / f"{name}.h5")
     return model, load_certified(folder / f"{name}.h5", model.system.layout), folder / f"{name}.h5"
 
