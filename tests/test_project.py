@@ -18,7 +18,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("fem", "reduction", "lqr", "study")
-OWN_COMMENTS = ("fem", "reduction", "lqr")  # packages whose fields have a comment each
+OWN_COMMENTS = PACKAGES  # whose fields have a comment each
 SCENES = ROOT / "demos" / "scenes"
 INSIDE = ROOT / "softgrasp"  # links in a checkout, folders in an unpacked sdist
 SOURCES = sorted(path for package in PACKAGES for path in (INSIDE / package).rglob("*.py"))

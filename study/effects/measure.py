@@ -52,7 +52,7 @@ class MeasuredScene:
     flops: float = 0.0  # operations of PETSc in a step, over all ranks [1]
     # what PETSc's log counts as created by build, factor, start and the first step, by class
     objects: dict[str, int] = field(default_factory=dict)
-    objects_in_steps: dict[str, int] = field(default_factory=dict)  # the same of the next steps
+    objects_in_steps: dict[str, int] = field(default_factory=dict)  # PETSc objects created by the next steps, by class
 
 
 def bare_output(scene: Scene) -> Scene:

@@ -11,8 +11,8 @@ from softgrasp.reduction.certified.validation import TestError
 class Size:
     """A certified model of k modes at all tests."""
 
-    k: int  # k, k2: modes of the answer, and of the basis that certifies it
-    k2: int
+    k: int  # modes of the answer
+    k2: int  # modes of the basis that certifies it
     N: int  # dimension of the answer
     query: float  # median seconds of an answer with its certificate
     tested: tuple[TestError, ...]  # one a parameter
