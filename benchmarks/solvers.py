@@ -90,4 +90,4 @@ def main(sizes: Sizes = "3,6") -> None:
                 f"{number(row.solve):>12}  {row.setup_ratio:.2f}, {row.solve_ratio:.2f}"
             )
     spread = np.exp(np.abs(np.log(ratios)).mean())
-    print(f"The model is off by a factor of {spread:.2g} in the geometric mean.")  # noqa: T201
+    print(f"The error of the model is a factor of {spread:.2g} in the geometric mean.")  # noqa: T201

@@ -22,7 +22,7 @@ BLOCK = 2**20  # bytes that are hashed at a time
 
 
 class _Hashed(io.RawIOBase):
-    """Writes into a file and hashes what passes."""
+    """File that hashes all bytes as they are written."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.file, self.sha = file, hashlib.sha256()

@@ -1,4 +1,4 @@
-"""Columns of outputs and of the hand: what they are called, along which axis, and in which unit."""
+"""Columns of outputs and of the hand: name, axis and unit."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def no_pipe(path: Path) -> Path:
 
 
 def shortened(value: str) -> str:
-    """A value as it stands in a sentence, at most 60 letters."""
+    """A value shortened for a sentence, to at most 60 letters."""
     return value if len(value) <= 60 else value[:57] + "..."
 
 

@@ -99,7 +99,7 @@ class BlockSystem:
 
     @property
     def weight(self) -> Array:
-        """What gravity adds to the force on the hand, (n_s,) [N, N m]."""
+        """Weight of the hand, zero unless gravity acts on it, (n_s,) [N, N m]."""
         return self.M_hand @ self.fall if self.hand_weight else np.zeros(self.layout.n_s)
 
     @property
@@ -159,7 +159,7 @@ def tissue_matrices(
 
 
 def layered_viscosity(layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...]) -> PETSc.Mat | None:
-    """D_ee = sum beta_k K_k when the layers differ in beta; None when one number says it. Collective."""
+    """D_ee = sum beta_k K_k when the layers differ in beta; None when they share one beta. Collective."""
     if len({m.beta for m in materials}) == 1:
         return None
     viscous = tuple(replace(m, lam=m.beta * m.lam, mu=m.beta * m.mu) for m in materials)

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 3"
 # what h5py and the reading of a model raise of a file that is not whole
 DAMAGE = (OSError, LookupError, TypeError, ValueError, RuntimeError, AttributeError, MemoryError)
-CHECKSUMS = ("sha256", "sha256_lift")  # attributes: of everything but the reconstruction, and of the reconstruction
+GROUP = "reconstruction"  # of the rows on the mesh; its checksum is an attribute sha256_reconstruction
+OLD_GROUP = "lift"  # its name in files of earlier versions, which stay readable
 ROWS = 1 << 16  # rows of the reconstruction read at a time: 30 MB for 60 columns
 # what a file says of a model in JSON, beside its materials and the names of its outputs
 LINEAR_KEYS = (
@@ -46,6 +47,8 @@ STRAIN_ARRAYS = {
     "parts": ("K_mu", "K_lambda", "G"),
 }
 FINER_ARRAYS = ("K_mu", "K_lambda", "G", "gram")
+# fields whose key in a file is another word
+FIELDS = {"tau": "cubature_tolerance", "residual": "cubature_residual", "reach": "largest_coordinates"}
 
 
 def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
@@ -80,7 +83,8 @@ def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
 def about(model: ReducedModel | StrainModel) -> dict[str, Any]:
     """What a file says of a model in JSON."""
     linear = isinstance(model, ReducedModel)
-    data: dict[str, Any] = {key: getattr(model, key) for key in (LINEAR_KEYS if linear else STRAIN_KEYS)}
+    keys = LINEAR_KEYS if linear else STRAIN_KEYS
+    data: dict[str, Any] = {key: getattr(model, FIELDS.get(key, key)) for key in keys}
     data |= {"materials": [asdict(m) for m in model.materials], "names": list(model.outputs.names)}
     return data if isinstance(model, ReducedModel) else data | {"law": model.cells.law}
 
@@ -91,7 +95,9 @@ def write_small(model: ReducedModel | StrainModel, file: h5py.File) -> None:
         groups = {"parts": model.parts}
     else:
         groups = {
-            group: {key: getattr(model if group == "parts" else getattr(model, group), key) for key in keys}
+            group: {
+                key: getattr(model if group == "parts" else getattr(model, group), FIELDS.get(key, key)) for key in keys
+            }
             for group, keys in STRAIN_ARRAYS.items()
         }
         if model.finer is not None:
@@ -139,17 +145,20 @@ def read_strain(file: h5py.File, data: dict[str, Any], layout: BlockLayout | Non
     """The same at finite strain."""
     from softgrasp.reduction.strain.cells import Cells  # only scenes with finite strain pay for it
     from softgrasp.reduction.strain.indicator import Finer
-    from softgrasp.reduction.strain.model import StrainModel, TrainedBox
+    from softgrasp.reduction.strain.model import StrainModel, TrainingDomain
 
-    cells, box, parts = ({key: file[f"{group}/{key}"][()] for key in keys} for group, keys in STRAIN_ARRAYS.items())
+    cells, box, parts = (
+        {FIELDS.get(key, key): file[f"{group}/{key}"][()] for key in keys} for group, keys in STRAIN_ARRAYS.items()
+    )
     shared, law = _read_shared(file, data), data.pop("law")
+    data = {FIELDS.get(key, key): value for key, value in data.items()}
     Phi = None if layout is None else np.asarray(read_reconstruction(file, layout).L_q)
     finer = None
     if "finer" in file:
         sampled = Cells(law, **{key: file[f"finer/cells/{key}"][()] for key in STRAIN_ARRAYS["cells"]})
         finer = Finer(sampled, **{key: file[f"finer/{key}"][()] for key in FINER_ARRAYS})
     return StrainModel(
-        cells=Cells(law, **cells), box=TrainedBox(**box), **parts, **shared, **data, layout=layout, Phi=Phi,
+        cells=Cells(law, **cells), box=TrainingDomain(**box), **parts, **shared, **data, layout=layout, Phi=Phi,
         finer=finer,
     )  # fmt: skip
 
@@ -212,8 +221,8 @@ def reading(
                 if file.attrs.get("format") not in (LINEAR, STRAIN):
                     raise ModelError(f"{path} is no reduced model of this version ({LINEAR!r}); reduce the scene again")
                 # one rank reads a reconstruction twice, not all of them
-                for name in CHECKSUMS if layout is not None and comm.rank == 0 else CHECKSUMS[:1]:
-                    if file.attrs[name] != _digest(file, name == CHECKSUMS[1]):
+                for rows in (False, True) if layout is not None and comm.rank == 0 else (False,):
+                    if file.attrs[_checksum(file, rows)] != _digest(file, rows):
                         raise ModelError(f"{path} is damaged: it is not what was written; reduce the scene again")
                 about = json.loads(file.attrs["model"])
                 if scene_hash is not None and about["scene_hash"] != scene_hash:
@@ -227,19 +236,30 @@ def reading(
 
 def write_checksums(file: h5py.File) -> None:
     """Write the hashes of all that a file holds."""
-    for name in CHECKSUMS:
-        file.attrs[name] = _digest(file, name == CHECKSUMS[1])
+    for rows in (False, True):
+        file.attrs[_checksum(file, rows)] = _digest(file, rows)
+
+
+def _group(file: h5py.File) -> str:
+    """Name of the group of the reconstruction in a file of this version or an earlier one."""
+    return OLD_GROUP if OLD_GROUP in file else GROUP
+
+
+def _checksum(file: h5py.File, reconstruction: bool) -> str:
+    """Name of the attribute with a :func:`_digest`."""
+    return f"sha256_{_group(file)}" if reconstruction else "sha256"
 
 
 def _digest(file: h5py.File, reconstruction: bool) -> str:
     """SHA-256 of the numbers of the reconstruction, or of all others with their attributes."""
-    names: list[str] = []
+    names, group = list[str](), _group(file)
+    checksums = [_checksum(file, rows) for rows in (False, True)]
     file.visit(names.append)
     digest = hashlib.sha256()
     for name in ["/", *sorted(names)]:
         item = file[name]
-        if name.startswith("lift") is reconstruction:
-            attributes = sorted((key, str(value)) for key, value in item.attrs.items() if key not in CHECKSUMS)
+        if name.startswith(group) is reconstruction:
+            attributes = sorted((key, str(value)) for key, value in item.attrs.items() if key not in checksums)
             digest.update(repr((name, attributes)).encode())
             if isinstance(item, h5py.Dataset):
                 digest.update(repr(item.shape).encode())
@@ -256,17 +276,17 @@ def _write_rows(reconstruction: Reconstruction, path: Path) -> None:
             if part is None:
                 continue
             n, start = (layout.n_e // d, layout.start // d) if key == "nodes" else (layout.n_e, layout.start)
-            rows = file.require_dataset(f"lift/{key}", (n, part.shape[1]), "f8")
+            rows = file.require_dataset(f"{GROUP}/{key}", (n, part.shape[1]), "f8")
             for at in range(0, len(part), ROWS):
                 rows[start + at : start + min(at + ROWS, len(part))] = part[at : at + ROWS]
 
 
 def read_reconstruction(file: h5py.File, layout: BlockLayout) -> Reconstruction:
     """Rows of this rank, found by the coordinates of its nodes."""
-    path, d = file.filename, layout.dimension
-    if "lift" not in file:
+    path, d, group = file.filename, layout.dimension, _group(file)
+    if group not in file:
         raise ModelError(f"{path} holds no basis on the mesh; load it without a layout, or reduce the scene again")
-    nodes = file["lift/nodes"][()]
+    nodes = file[f"{group}/nodes"][()]
     if nodes.shape != (layout.n_e // d, d):
         raise ModelError(
             f"{path} belongs to a mesh of {len(nodes)} free nodes in {nodes.shape[1]}D, this one has "
@@ -278,7 +298,7 @@ def read_reconstruction(file: h5py.File, layout: BlockLayout) -> Reconstruction:
     if distance.max(initial=0.0) > 1e-9 * size or len(np.unique(index)) != len(index):
         raise ModelError(f"{path} belongs to another mesh: its nodes lie elsewhere; load it with its own scene")
     rows = (index[:, None] * d + np.arange(d)).ravel()
-    arrays = {key: _pick(file[f"lift/{key}"], rows) for key in ("L_q", "L_v", "W_G") if f"lift/{key}" in file}
+    arrays = {key: _pick(file[f"{group}/{key}"], rows) for key in ("L_q", "L_v", "W_G") if f"{group}/{key}" in file}
     return Reconstruction(layout, arrays["L_q"], arrays["L_v"], arrays.get("W_G"))
 
 

@@ -1,4 +1,4 @@
-"""How far reduced models are from the full one: states, deformation, energy, and the projection error of their basis.
+"""Errors of reduced models against the full one: states, deformation, energy, and the projection error of their basis.
 
 Everything that a model shows is linear in Y = [x; q_s; v_s], its state and its hand. With one QR factorisation V = Q R
 of what the largest model of a family shows, and snapshots X = Q C + rest,
@@ -22,7 +22,7 @@ from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.engines import factor
-from softgrasp.reduction.model import ModelError, ReducedModel, SmallModel
+from softgrasp.reduction.model import ModelError, ReducedModel, ReducedSystem
 from softgrasp.reduction.online import ReducedTrajectory
 
 BLOCK = 64  # columns at a time: 64 columns of both states are a small part of the snapshots themselves
@@ -40,8 +40,8 @@ class ModelErrors:
     """Relative errors of a reduced run against snapshots of the full one, dimensionless."""
 
     error: float  # |X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e] in absolute coordinates: the paper's error [SBRH21]
-    error_canonical: float  # the same of X = [q_s, p_s, q_e, p_e], which canonical bases are built from
-    error_deformation: float  # the same of [z, v_z], after removing the rigid motion of the hand
+    error_canonical: float  # |X - X_r|_F / |X|_F of X = [q_s, p_s, q_e, p_e], from which canonical bases are built
+    error_deformation: float  # |X - X_r|_F / |X|_F of X = [z, v_z], relative to the rigid motion of the hand
     error_energy: float  # max_t |H_r - H| / max_t H of the tissue's energy relative to the hand
 
 
@@ -84,8 +84,8 @@ def row_weights(system: BlockSystem) -> tuple[Array, float]:
     return np.sqrt(diagonal)[:, None], float(np.sqrt(whole[0] / whole[1]))
 
 
-def shown_rows(view: View, model: ReducedModel, small: SmallModel, system: BlockSystem) -> Array:
-    """V with V Y = what the model shows for Y = [x; q_s; v_s], local rows, (..., N + 2 n_s). Collective.
+def shown_rows(view: View, model: ReducedModel, small: ReducedSystem, system: BlockSystem) -> Array:
+    """V with V Y = the state of the model for Y = [x; q_s; v_s], local rows, (..., N + 2 n_s). Collective.
 
     Raises ModelError: the model holds no basis on the mesh.
     """
@@ -152,8 +152,8 @@ def span_of(view: View, V: Array, system: BlockSystem, snapshots: Snapshots) -> 
 class ModelComparison:
     """Errors of one model, or of a whole family of nested ones, against one full run."""
 
-    model: ReducedModel  # model, small: the largest model of the family, at the parameter of the snapshots
-    small: SmallModel
+    model: ReducedModel  # largest model of the family
+    small: ReducedSystem  # its system at the parameter of the snapshots
     system: BlockSystem  # of the full run
     snapshots: Snapshots  # of the full run
     energy: Array  # :func:`full_energy` of the snapshots
@@ -169,7 +169,7 @@ class ModelComparison:
             self._spans[view] = span_of(view, V, self.system, self.snapshots)
         return self._spans[view]
 
-    def state_error(self, view: View, model: ReducedModel, small: SmallModel, run: ReducedTrajectory) -> float:
+    def state_error(self, view: View, model: ReducedModel, small: ReducedSystem, run: ReducedTrajectory) -> float:
         """|X - X_r|_F / |X|_F of a run on the full model's time grid, of the largest model or a smaller. Collective.
 
         Raises ModelError: the run is shorter than the snapshots, or the model shows more than the largest.
@@ -181,14 +181,14 @@ class ModelComparison:
         Y = np.vstack([run.x[steps].T, run.q_s[steps].T, run.v_s[steps].T])
         return span.error(span.inside(shown_rows(view, model, small, self.system)), Y)
 
-    def errors(self, model: ReducedModel, small: SmallModel, run: ReducedTrajectory) -> ModelErrors:
+    def errors(self, model: ReducedModel, small: ReducedSystem, run: ReducedTrajectory) -> ModelErrors:
         """All errors of a run; see :meth:`state_error`. Collective."""
         velocities, momenta, deformation = (self.state_error(view, model, small, run) for view in VIEWS)
-        off = np.abs(small.energy(run.x[self.snapshots.steps]) - self.energy).max(initial=0.0)
+        error = np.abs(small.energy(run.x[self.snapshots.steps]) - self.energy).max(initial=0.0)
         peak = float(self.energy.max(initial=0.0))
-        return ModelErrors(velocities, momenta, deformation, float(off) / (peak if peak > 0 else 1.0))
+        return ModelErrors(velocities, momenta, deformation, float(error) / (peak if peak > 0 else 1.0))
 
-    def projection_error(self, view: View, model: ReducedModel, small: SmallModel) -> float:
+    def projection_error(self, view: View, model: ReducedModel, small: ReducedSystem) -> float:
         """min_Y |X - V Y|_F / |X|_F over all states V y, with the hand q_s = S_q y and v_s = S_v y. Collective.
 
         Raises ModelError: the model shows more than the largest.
@@ -198,7 +198,7 @@ class ModelComparison:
         return span.projection_error(R @ with_hand(small))
 
 
-def with_hand(small: SmallModel) -> Array:
+def with_hand(small: ReducedSystem) -> Array:
     """[I; S_q; S_v]: the hand that belongs to a reduced state, (N + 2 n_s, N)."""
     return np.vstack([np.eye(small.N), small.operators.S_q, small.operators.S_v])
 

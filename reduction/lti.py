@@ -26,13 +26,13 @@ class LTI:
     (('force_x [N]', 'force_y [N]'), (1, 2, 2))
     """
 
-    E: Array  # E, A: (N, N)
-    A: Array
+    E: Array  # mass-like matrix, (N, N)
+    A: Array  # system matrix, (N, N)
     B: Array  # input of the force and torque u on the hand, (N, n_s)
-    C: Array  # (p, N)
-    states: tuple[str, ...]  # states, inputs, outputs: names with units, "tip_x [m]"
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
+    C: Array  # outputs of the state, (p, N)
+    states: tuple[str, ...]  # names of the states with their units, "q_x [m]"
+    inputs: tuple[str, ...]  # names of the inputs with their units, "force_x [N]"
+    outputs: tuple[str, ...]  # names of the outputs with their units, "tip_x [m]"
 
     def at(self, s: Sequence[complex] | np.ndarray) -> np.ndarray:
         """Transfer function C (s E - A)^{-1} B at points s [1/s], (len(s), p, n_s)."""

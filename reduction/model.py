@@ -1,4 +1,4 @@
-"""Reduced models: small matrices for every material and gravity, and the small model at one of them."""
+"""Reduced models: small matrices for every material and gravity, and the system at one of them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Outputs:
 
 
 @dataclass(frozen=True)
-class SmallModel:
+class ReducedSystem:
     """E x' = A x + B u + f, q_s = S_q x, v_s = S_v x, y = C_z x + C_s q_s at one parameter, of dimension N.
 
     Everything that a run needs, nothing of full order. The state x has no unit of its own: with fixed solid modes its
@@ -153,31 +153,51 @@ class ReducedModel:
     """E x' = A x + B u + F g for all lambda, mu, rho of every layer: a new parameter costs no full-order work.
 
     The matrices are sums over the layers, A = A_0 + sum_l lambda_l A_lambda,l + mu_l A_mu,l and so on, which
-    :meth:`at` assembles; a run needs the :class:`SmallModel` that it returns.
+    :meth:`at` assembles; a run needs the :class:`ReducedSystem` that it returns.
     """
 
-    name: str  # of the basis
-    N: int  # number of basis vectors
-    coordinates: Coordinates  # "qv" is the paper's Galerkin model, "qp" a canonical one
-    frame: Frame  # absolute or relative to the hand
-    structure: Structure  # of the basis
-    fixed_solid: bool  # the first 2 n_s coordinates are q_s and v_s
-    parts: Parts  # small matrices, the same bits on every rank
-    materials: tuple[LayerMaterial, ...]  # those of the projection
-    outputs: Outputs  # of the scene
-    split: tuple[int, ...] = ()  # columns of every part of the decomposition, see ``Basis.split``
-    alpha: float = 0.0  # mass-proportional damping [1/s]
-    in_space: bool = False  # alpha drags the rigid motion too
-    damped: bool = False  # damping terms were projected
-    hand_weight: bool = False  # gravity acts on the hand's own mass
-    two_way: bool = False  # the hand feels the tissue
-    gravity: Array | None = None  # acceleration of free fall in the hand's degrees of freedom, (n_s,), or None
-    reconstruction: Reconstruction | None = None  # how states return to the mesh, or None
-    scene_hash: str = ""  # of the scene the model was made for
-    origin: dict[str, Any] = field(default_factory=dict)  # of `reduction.origin`, what that scene says of a run; or {}
-    seconds: dict[str, float] = field(default_factory=dict)  # offline time by stage
+    name: str
+    """Name of the basis."""
+    N: int
+    """Number of basis vectors, the dimension of the first-order model."""
+    coordinates: Coordinates
+    """"qv" of the paper's Galerkin model, "qp" of a canonical one."""
+    frame: Frame
+    """Frame of the tissue rows: absolute, or relative to the hand."""
+    structure: Structure
+    """Structure that the basis keeps: "none", "symplectic" or "second_order"."""
+    fixed_solid: bool
+    """Whether the first 2 n_s coordinates are q_s [m, rad] and v_s [m/s, rad/s]."""
+    parts: Parts
+    """Small matrices by name, the same bits on every rank; those of every layer with a leading axis."""
+    materials: tuple[LayerMaterial, ...]
+    """Materials of the projection, one a layer."""
+    outputs: Outputs
+    """Outputs of the scene, y = C_z x + C_s q_s."""
+    split: tuple[int, ...] = ()
+    """Number of columns of every part of the decomposition, see :class:`softgrasp.reduction.bases.basis.Basis`."""
+    alpha: float = 0.0
+    """Mass-proportional damping [1/s]."""
+    in_space: bool = False
+    """Whether alpha drags the rigid motion too."""
+    damped: bool = False
+    """Whether damping terms were projected."""
+    hand_weight: bool = False
+    """Whether gravity acts on the hand's own mass."""
+    two_way: bool = False
+    """Whether the hand feels the tissue."""
+    gravity: Array | None = None
+    """Acceleration of free fall in the hand's degrees of freedom, (n_s,) [m/s^2], or None."""
+    reconstruction: Reconstruction | None = None
+    """Rows that return reduced states to the mesh, or None."""
+    scene_hash: str = ""
+    """Hash of the scene that the model was made for."""
+    origin: dict[str, Any] = field(default_factory=dict)
+    """Settings of that scene that a run depends on, see :mod:`softgrasp.reduction.origin`; or empty."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Offline time by stage [s]."""
 
-    def at(self, materials: tuple[LayerMaterial, ...] | None = None, gravity: Array | None = None) -> SmallModel:
+    def at(self, materials: tuple[LayerMaterial, ...] | None = None, gravity: Array | None = None) -> ReducedSystem:
         """Assemble E x' = A x + B u + F g at new materials and gravity. Online; not collective.
 
         A (q, v) model is affine in mu, lambda, rho, beta mu and beta lambda of each layer. A canonical one needs
@@ -199,7 +219,7 @@ class ReducedModel:
         g = self.gravity if gravity is None else np.asarray(gravity, dtype=float)
         conservative = not p.damped or (p.alpha == 0 and all(m.beta == 0 for m in materials))
         kept = self.coordinates == "qp" or self.structure == "second_order"
-        return SmallModel(
+        return ReducedSystem(
             name=self.name,
             operators=operators,
             f=np.zeros(self.N) if g is None else operators.F @ g,
@@ -212,7 +232,7 @@ class ReducedModel:
         )
 
     def lti(self, materials: tuple[LayerMaterial, ...] | None = None) -> LTI:
-        """The linear time-invariant system at some materials, see :meth:`SmallModel.lti`; as for :meth:`at`."""
+        """The linear time-invariant system at some materials, see :meth:`ReducedSystem.lti`; as for :meth:`at`."""
         return self.at(materials).lti()
 
     def parameters(self, materials: tuple[LayerMaterial, ...]) -> Parameters:
@@ -244,7 +264,7 @@ class ReducedModel:
                 )
         return Parameters(materials, self.alpha, self.damped, self.in_space, self.hand_weight, self.two_way, scale)
 
-    def reconstruct(self, small: SmallModel, x: Array, v_s: Array | None = None) -> tuple[Array, Array]:
+    def reconstruct(self, small: ReducedSystem, x: Array, v_s: Array | None = None) -> tuple[Array, Array]:
         """Relative tissue states of reduced states x (N, m): z and v_z, local rows (n_local, m).
 
         Args:

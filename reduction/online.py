@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.model import ModelError, SmallModel, UnstableModelError
+from softgrasp.reduction.model import ModelError, ReducedSystem, UnstableModelError
 from softgrasp.reduction.propagator import Propagator, march, march_together, propagator
 
 # byte of the matrices of a batch up to which all models step together; somewhere between 4 and 11 MB they leave the
@@ -22,9 +22,8 @@ class ReducedTrajectory:
 
     times: Array  # (steps + 1,) [s]
     x: Array  # reduced states, (steps + 1, N)
-    # q_s, v_s: hand, (steps + 1, n_s)
-    q_s: Array
-    v_s: Array
+    q_s: Array  # displacement of the hand, (steps + 1, n_s) [m, rad]
+    v_s: Array  # velocity of the hand, (steps + 1, n_s) [m/s, rad/s]
     outputs: Array  # y, (steps + 1, p) [m]
     output_names: tuple[str, ...]  # one per component
 
@@ -39,7 +38,7 @@ def _check_stable(step: Propagator, allow_unstable: bool) -> None:
 
 
 def run(
-    model: SmallModel | Propagator,
+    model: ReducedSystem | Propagator,
     dt: float | None = None,
     force: Array | None = None,
     hand: tuple[Array, Array] | None = None,
@@ -75,9 +74,9 @@ def run(
     return trajectory(step, w, hand)
 
 
-def prepared(model: SmallModel | Propagator, dt: float | None, driven: bool) -> Propagator:
+def prepared(model: ReducedSystem | Propagator, dt: float | None, driven: bool) -> Propagator:
     """A propagator for the kind of input; checks one that was made beforehand."""
-    if isinstance(model, SmallModel):
+    if isinstance(model, ReducedSystem):
         if dt is None:
             raise ModelError("give the time step dt [s]")
         return propagator(model, dt, driven)
@@ -102,7 +101,7 @@ def checked_hand(hand: tuple[Array, Array], n_s: int) -> tuple[Array, Array]:
     return q, v
 
 
-def hand_inputs(model: SmallModel, hand: tuple[Array, Array], dt: float) -> Array:
+def hand_inputs(model: ReducedSystem, hand: tuple[Array, Array], dt: float) -> Array:
     """Mean position, velocity and acceleration of each step from tables (steps + 1, n_s); (steps, 3 n_s)."""
     q, v = checked_hand(hand, model.n_s)
     q = consistent(q, v, dt)
@@ -131,7 +130,7 @@ class Stepper:
 
     def __init__(
         self,
-        model: SmallModel | Propagator,
+        model: ReducedSystem | Propagator,
         dt: float | None = None,
         x0: Array | None = None,
         allow_unstable: bool = False,
@@ -167,7 +166,7 @@ class Stepper:
 
 
 def run_batch(
-    models: Sequence[SmallModel | Propagator],
+    models: Sequence[ReducedSystem | Propagator],
     dt: float,
     forces: Array | None = None,
     allow_unstable: bool = False,

@@ -89,13 +89,11 @@ class Parameters:
 class Operators:
     """E x' = A x + B u + F g of dimension N, its hand and its energies."""
 
-    E: Array  # E, A: (N, N)
-    A: Array
+    E: Array  # mass-like matrix, (N, N)
+    A: Array  # system matrix, (N, N)
     B: Array  # input of the force u on the hand, (N, n_s)
     F: Array  # input of the acceleration of free fall g, (N, n_s)
-    S_q: Array  # S_q, S_v: q_s = S_q x and v_s = S_v x, (n_s, N)
-    S_v: Array
+    S_q: Array  # displacement of the hand, q_s = S_q x, (n_s, N)
+    S_v: Array  # velocity of the hand, v_s = S_v x, (n_s, N)
     energy: Array  # x' energy x / 2 is the tissue's energy (z' K z + v_z' M v_z) / 2 [J]
-    # the same with the kinetic energy of the hand; two-way also that of the tissue's rigid motion, which makes it the
-    # Hamiltonian
-    total: Array
+    total: Array  # ``energy`` with the hand's kinetic energy; two-way also of the rigid motion: the Hamiltonian [J]

@@ -22,7 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.model import ModelError, SmallModel
+from softgrasp.reduction.model import ModelError, ReducedSystem
 from softgrasp.reduction.spectrum import NULL_TOLERANCE, balanced, energy_factor, is_skew, skew_modes
 
 STEPS = 8  # in one product: more would not gain at N = 30, where a product costs as much as the call
@@ -58,9 +58,9 @@ def rotation(angle: Array) -> tuple[Array, Array]:
 class StepCoordinates:
     """x = X w, with what is known of a step in w."""
 
-    X: Array  # X, X_inverse: x = X w and w = X_inverse x
-    X_inverse: Array
-    omega: Array  # frequencies of the pairs of modes that follow each other from ``first`` on
+    X: Array  # columns of the coordinates, x = X w, (N, k)
+    X_inverse: Array  # coordinates of a state, w = X_inverse x, (k, N)
+    omega: Array  # angular frequencies of the pairs of modes that follow each other from ``first`` on, (m,) [1/s]
     first: int = 0  # number of the first mode
     # number of coordinates after the modes that nothing moves; the modes then move each other alone. None when other
     # coordinates may move the modes.
@@ -85,12 +85,10 @@ class Modal:
     """Steps of w = [pairs; still; free], mode by mode."""
 
     angle: Array  # of a step, one a pair (m,)
-    # of the inputs and of a constant 1 to dt g / (1 - i omega dt / 2), real and imaginary rows by turns, (2 m, i + 1)
-    # for i inputs
+    # from i inputs and a constant 1 to dt g / (1 - i omega dt / 2), real and imaginary rows by turns, (2 m, i + 1)
     load: Array
-    rest: Array  # the same to dt g of all other coordinates, (still + free, i + 1)
-    # what pairs and still ones do to the free ones in a step, w_f += pull (w_n + w_{n+1}), (free, 2 m + still)
-    pull: Array
+    rest: Array  # from i inputs and a constant 1 to dt g of all other coordinates, (still + free, i + 1)
+    pull: Array  # of pairs and still ones on the free ones in a step, w_f += pull (w_n + w_{n+1}), (free, 2 m + still)
 
     def march(self, inputs: Array, start: Array) -> Array:
         """States w of all steps, (steps + 1, k), for inputs (steps, i) and a start (k,)."""
@@ -142,14 +140,14 @@ class Propagator:
     A conservative model also has ``modal``, which runs without either; they are then made when they are first used.
     """
 
-    model: SmallModel  # what it steps
+    model: ReducedSystem  # what it steps
     dt: float  # step [s]
     at: StepCoordinates  # coordinates, x = X w
-    E: Array  # E, A: of the equations that are stepped, all of the model or those of its tissue
-    A: Array
+    E: Array  # E of the stepped equations, all of the model or those of its tissue, (n, n)
+    A: Array  # A of the stepped equations, (n, n)
     loads: Array  # [input of u, constant load], (N or the tissue's own coordinates, m + 1)
     driven: bool = False  # the hand is prescribed: w holds the tissue only, and the inputs are the hand's in a step
-    modal: Modal | None = None  # the same mode by mode, for conservative models
+    modal: Modal | None = None  # the step mode by mode, for conservative models
 
     @property
     def size(self) -> int:
@@ -205,7 +203,7 @@ class Propagator:
         return P
 
 
-def _coordinates(model: SmallModel, driven: bool) -> StepCoordinates:
+def _coordinates(model: ReducedSystem, driven: bool) -> StepCoordinates:
     """Energy coordinates: of the tissue alone where the hand is driven, else of the whole state."""
     apart, k, N = model.fixed_solid and (driven or not model.two_way), 2 * model.n_s, model.N
     whole = None if apart or not model.structured else _whole(model)
@@ -221,7 +219,7 @@ def _coordinates(model: SmallModel, driven: bool) -> StepCoordinates:
     return StepCoordinates(X, X_inverse, tissue.omega, k)
 
 
-def _tissue(model: SmallModel, apart: bool) -> StepCoordinates:
+def _tissue(model: ReducedSystem, apart: bool) -> StepCoordinates:
     """Coordinates of the tissue beside the hand's own; ``apart`` if no hand moves with it, so that it has modes."""
     op, block = model.operators, slice(2 * model.n_s, model.N)
     E, A, L = op.E[block, block], op.A[block, block], energy_factor(op.energy[block, block])
@@ -237,7 +235,7 @@ def _tissue(model: SmallModel, apart: bool) -> StepCoordinates:
     return StepCoordinates(np.linalg.solve(L.T, U), U.T @ L.T, omega, 0, still)
 
 
-def _whole(model: SmallModel) -> StepCoordinates | None:
+def _whole(model: ReducedSystem) -> StepCoordinates | None:
     """Coordinates w = [modes; still; free] of a conservative model with its hand inside, H = |modes, still|^2 / 2.
 
     H is semidefinite: displacements of the free hand cost nothing. With H = y'y / 2, y = R x and y' = R E^-1 A R^+ y, a
@@ -260,7 +258,7 @@ def _whole(model: SmallModel) -> StepCoordinates | None:
     return StepCoordinates(X, X_inverse, omega, 0, len(root) - 2 * len(omega))
 
 
-def propagator(model: SmallModel, dt: float, driven: bool = False) -> Propagator:
+def propagator(model: ReducedSystem, dt: float, driven: bool = False) -> Propagator:
     """Precompute a step of size dt. Online; not collective.
 
     Args:

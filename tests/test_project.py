@@ -18,6 +18,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("fem", "reduction", "lqr", "study")
+OWN_COMMENTS = PACKAGES  # whose fields have a comment each
 SCENES = ROOT / "demos" / "scenes"
 INSIDE = ROOT / "softgrasp"  # links in a checkout, folders in an unpacked sdist
 SOURCES = sorted(path for package in PACKAGES for path in (INSIDE / package).rglob("*.py"))
@@ -51,6 +52,42 @@ PRIVATE = re.compile(  # words of docs/style.md that a sentence of a command, a 
     r"|regulator|observable)\b",
     re.IGNORECASE,
 )
+
+
+GROUP_COMMENT = re.compile(r"# *[A-Za-z_]\w*(, *[A-Za-z_]\w*)+ *:|# *(of |in )?the same\b")
+
+
+def group_comments(text: str) -> list[int]:
+    """Lines with a comment for several fields of a class, `# a, b:`, or one that refers to another field."""
+    lines, found = text.splitlines(), set()
+    for node in ast.walk(ast.parse(text)):
+        for field in node.body if isinstance(node, ast.ClassDef) else ():
+            if isinstance(field, ast.AnnAssign):
+                own = [field.lineno]
+                while lines[own[-1] - 2].lstrip().startswith("#"):
+                    own.append(own[-1] - 1)
+                found |= {n for n in own if GROUP_COMMENT.search(lines[n - 1])}
+    return sorted(found)
+
+
+@pytest.mark.serial
+def test_every_field_has_a_comment_of_its_own() -> None:
+    """Not one for several fields, which a reader has to take apart."""
+    bad = [
+        "class A:",
+        "    # a, b: sizes",
+        "    a: int",
+        "    b: int",
+        "    c: int  # the same of b",
+        "    d: int  # one",
+    ]
+    assert group_comments("\n".join(bad)) == [2, 5]
+    found = {
+        str(path.relative_to(INSIDE)): lines
+        for path in SOURCES
+        if path.relative_to(INSIDE).parts[0] in OWN_COMMENTS and (lines := group_comments(path.read_text()))
+    }
+    assert found == {}
 
 
 @pytest.mark.serial

@@ -58,7 +58,7 @@ class KrylovModel:
 
 @contextmanager
 def static_solves(model: Model) -> Iterator[Solve]:
-    """What applies K_ee^-1 to columns, factored once. Collective."""
+    """Function X -> K_ee^-1 X on local rows, factored once. Collective."""
     with factored_stiffness(model.system, rtol=1e-10) as solver:
         yield solver.columns
 

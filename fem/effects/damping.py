@@ -39,7 +39,7 @@ class DampingEffect(Effect):
     name = "damping"
     term = "D_ee z' with D_ee = alpha M_ee + beta K_ee; with drag = 'space' also alpha G q_s'"
     cost = (
-        "Equal damping in all layers takes no matrix and a few vector operations a step; layers that differ take D_ee "
+        "Equal damping in all layers needs no matrix and a few vector operations a step; layers that differ need D_ee "
         "and two products."
     )
 

@@ -36,12 +36,12 @@ class FiniteStrainEffect(Effect):
         condition = ""
         if scene.effects.rotation and not self.active(scene):
             condition = "cannot be tried beside effects.rotation"
-            sentence = f"Off; linear elasticity would be off by about {number:.2g} of the deformation; "
+            sentence = f"Off; linear elasticity would have an error of about {number:.2g} of the deformation; "
             sentence += "the linearised rotation does not go with finite strain."
             return Gate(number, symbol, self.threshold, False, sentence, condition=condition)
         if self.active(scene):
-            sentence = f"Linear elasticity would be off by about {number:.2g} of the deformation."
+            sentence = f"Linear elasticity would have an error of about {number:.2g} of the deformation."
         else:
-            sentence = f"Off; linear elasticity is off by about {number:.2g} of the deformation"
+            sentence = f"Off; linear elasticity has an error of about {number:.2g} of the deformation"
             sentence += ": set effects.finite_strain.law = 'neo-hooke'." if number > self.threshold else "."
         return Gate(number, symbol, self.threshold, number > self.threshold, sentence)

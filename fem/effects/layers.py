@@ -12,7 +12,7 @@ class LayersEffect(Effect):
 
     name = "layers"
     term = "sums over the layers in M and K"
-    cost = "Each layer takes 3 tissue matrices, which new materials need no assembly for; a step costs nothing more."
+    cost = "Each layer needs 3 tissue matrices, which serve new materials without assembly; a step does no more work."
     threshold = 1.05  # stiffness within 5 % is one material for any purpose here
 
     def active(self, scene: Scene) -> bool:

@@ -28,9 +28,9 @@ class ReactionEffect(Effect):
         on, driven = self.active(scene), force_drives(scene)
         where = "" if scene.motion.drive == "force" else " in the control problem"
         if driven and on:
-            sentence = f"The tissue takes about {change:.1%} off the acceleration that a force gives the hand{where}."
+            sentence = f"The tissue reduces the acceleration of the hand under a force by about {change:.1%}{where}."
         elif driven:
-            sentence = f"Off; it would take about {change:.1%} off the acceleration a force gives the hand{where}."
+            sentence = f"Off; it would reduce the acceleration of the hand under a force by about {change:.1%}{where}."
         else:
             sentence = "The motion of the hand is prescribed, so the reaction moves nothing."
         proviso = where.removeprefix(" ") if driven else ""

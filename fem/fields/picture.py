@@ -19,7 +19,7 @@ Integers = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class PictureMesh:
-    """The whole body in arrays."""
+    """The mesh of the whole body in arrays, on rank 0."""
 
     points: Array  # vertices [m], shape (n, d)
     cells: Integers  # vertices of the cells, shape (m, d + 1)
@@ -28,7 +28,7 @@ class PictureMesh:
     layers: Integers  # number of the layer of each cell, shape (m,)
     names: tuple[str, ...]  # name of each layer
     reference: Array  # point the hand turns about [m], shape (d,)
-    n_s: int  # hand degrees of freedom
+    n_s: int  # number of degrees of freedom of the hand [1]
 
     @property
     def dimension(self) -> int:

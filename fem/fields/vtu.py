@@ -152,7 +152,7 @@ class Collection:
         path.write_bytes(f"{HEAD.format('Collection')}<!--{remark}-->\n<Collection>\n".encode() + self.END)
 
     def add(self, t: float, file: Path, checks: str) -> None:
-        """Append the file of an instant t [s] with its checksum, which stands in a remark behind it."""
+        """Append the file of an instant t [s] with its checksum in a comment behind it."""
         with self.path.open("r+b") as stream:
             stream.seek(-len(self.END), 2)
             line = f'<DataSet timestep="{float(t)!r}" part="0" file="{file.relative_to(self.path.parent)}"/>'

@@ -1,4 +1,4 @@
-"""What may be wrong with a simplex mesh in arrays: flat or inverted cells, open seams, loose parts (not collective).
+"""Faults of a simplex mesh in arrays: flat or inverted cells, open seams, loose parts (not collective).
 
 ``points`` are coordinates (n_points, d) [m], d = 2 or 3, ``cells`` nodes (n_cells, d + 1), ``facets`` those of
 :func:`sort_facets`, and ``name`` is that of the mesh, for messages.
@@ -145,7 +145,7 @@ def sort_facets(cells: Integers) -> Facets:
 
 
 def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: float) -> Integers:
-    """The node that stands for each node: itself, or the first of the boundary nodes at its place.
+    """Representative of each node: itself, or the first of the boundary nodes at its place.
 
     Two boundary nodes are at one place if |x - y| <= tolerance h, h the shortest edge of the boundary cells at both.
 

@@ -187,7 +187,7 @@ class BoxAxis:
 
 
 def box_axes(scene: Scene) -> tuple[BoxAxis, ...]:
-    """What the lines of a structured box must meet.
+    """Constraints on the lines of a structured box.
 
     Lines meet the box of the contact zone, the boxes of layers and the points of outputs, and the zone ends at its
     sides and at its box.

@@ -12,7 +12,7 @@ from softgrasp.fem.scene.scene import Scene
 
 
 def scene_hash(scene: Scene, without: Iterable[str] = ("name", "description")) -> str:
-    """SHA-256 of the resolved scene, of what its mesh file holds and of the bytes of its csv file, 64 hex digits.
+    """SHA-256 of the resolved scene, of the contents of its mesh file and of the bytes of its csv file, 64 hex digits.
 
     Top-level keys in `without` do not count; nor do folder, name and format of the files. The mesh is the one that the
     model of this scene was built with; without a model it is read. Raises SceneError, MeshError: a file that the scene
@@ -22,7 +22,7 @@ def scene_hash(scene: Scene, without: Iterable[str] = ("name", "description")) -
 
 
 def scene_keys(scene: Scene) -> dict[str, Any]:
-    """Value of every key of the resolved scene by its whole name, a file by the hash of what it holds; None left out.
+    """Value of every key of the resolved scene by its whole name, a file by the hash of its contents; None left out.
 
     Raises SceneError, MeshError: as :func:`scene_hash`.
     """

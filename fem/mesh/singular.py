@@ -20,7 +20,7 @@ Kind = Literal["contact end", "re-entrant", "held corner", "layer end"]
 
 KINDS: tuple[Kind, ...] = ("re-entrant", "contact end", "held corner")  # by the number of sides held
 REGULAR = 0.8  # exponents above cost no order that a mesh of practical size would show: 2 alpha is nearly that of P1
-STRAIGHT = 1e-6  # [rad]; angles of a flat boundary are off by rounding only
+STRAIGHT = 1e-6  # largest deviation of the angle of a flat boundary [rad]: rounding only
 
 
 @dataclass(frozen=True)

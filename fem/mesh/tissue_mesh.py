@@ -33,14 +33,14 @@ class MeshArrays:
 
 @dataclass(frozen=True)
 class Whole:
-    """A simplex mesh on one rank with what its cells and facets carry."""
+    """A simplex mesh on one rank with the marks of its cells and facets."""
 
     mesh: dolfinx.mesh.Mesh  # on MPI.COMM_SELF
-    source: str  # its name, for messages
-    cells: dict[str, Ints]  # one mark a cell by field of TissueMesh: cell_tags, layers
-    facets: dict[str, dolfinx.mesh.MeshTags]  # marks likewise: facet_tags, contact
-    facet_sets: Sets = field(default_factory=dict)  # see TissueMesh
-    cell_sets: Sets = field(default_factory=dict)
+    source: str  # name of the mesh, for messages
+    cells: dict[str, Ints]  # mark of each cell, (n_cells,), for the fields cell_tags and layers of TissueMesh
+    facets: dict[str, dolfinx.mesh.MeshTags]  # marks of facets for the fields facet_tags and contact of TissueMesh
+    facet_sets: Sets = field(default_factory=dict)  # marks in facet_tags of each tag number and named set
+    cell_sets: Sets = field(default_factory=dict)  # marks in cell_tags of each tag number and named set
 
     @property
     def dimension(self) -> int:
@@ -67,7 +67,7 @@ class Whole:
 
 @dataclass(frozen=True)
 class TissueMesh:
-    """A mesh of linear triangles or tetrahedra and what is known of it."""
+    """A distributed mesh of linear triangles or tetrahedra, its marks and its origin."""
 
     mesh: dolfinx.mesh.Mesh  # distributed mesh; the topological dimension equals the geometric one
     dimension: int  # 2 or 3
@@ -76,7 +76,7 @@ class TissueMesh:
     cell_tags: dolfinx.mesh.MeshTags | None = None  # integer marks of cells (layers)
     # number of the part of each cell, parts hanging together through facets; None if it is one
     part_tags: dolfinx.mesh.MeshTags | None = None
-    parts: Parts | None = None  # what is known of these parts, or None
+    parts: Parts | None = None  # size, place and joints of these parts; None if it is one
     facet_sets: Sets = field(default_factory=dict)  # marks in ``facet_tags``, on all ranks
     cell_sets: Sets = field(default_factory=dict)  # marks in ``cell_tags``, on all ranks
     notes: tuple[str, ...] = ()  # warnings about the file, one sentence each, on all ranks

@@ -1,4 +1,4 @@
-"""The contact zone: which facets the hand holds, their nodes, and the rigid motions it gives them."""
+"""The contact zone: its facets, their nodes, and the rigid motions of these nodes."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.petsc import on_root
 from softgrasp.fem.scene.scene import Contact
 
-HINGE = 1e-12  # of C^T C: shared nodes nearer than 1e-6 of the part are one node
-MOST_LOOSE = 300  # a dense problem of at most 1800 unknowns
-BOX_TOLERANCE = 1e-8  # of the largest extent: far above round-off of midpoints, far below any cell
+HINGE = 1e-12  # eigenvalue of C^T C over the largest, below which a motion is free [1]: nodes 1e-6 of the part apart
+MOST_LOOSE = 300  # largest number of parts without contact facet [1]: a dense problem of at most 1800 unknowns
+BOX_TOLERANCE = 1e-8  # tolerance of places over the largest extent [1]: far above rounding, far below any cell
 
 
 def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
@@ -124,7 +124,7 @@ def check_parts(parts: Parts, held: Flags, source: str) -> None:
 
 
 def _moving(parts: Parts, held: Flags, source: str) -> Flags:
-    """The parts that move in some null vector of C^T C."""
+    """Whether each part moves in some null vector of C^T C, (n_parts,)."""
     d = parts.points.shape[1]
     free = np.flatnonzero(~held)
     if not free.size:

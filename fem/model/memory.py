@@ -1,4 +1,4 @@
-"""What a scene needs in memory, estimated before anything is allocated, against what the machine has."""
+"""Memory of a model, estimated before anything is allocated, against the free memory of the machine."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Need:
     tables: float  # of hand, loads and outputs over the steps, on every rank
 
     def of(self, share: float, ranks: int) -> float:
-        """What ``ranks`` ranks need that hold this share of the tissue."""
+        """Memory of ``ranks`` ranks with this share of the tissue [byte]."""
         return share * (self.mesh + self.factor) + ranks * self.tables
 
 
@@ -126,7 +126,7 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
 def _fitting(
     scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, cells: int, share: float, ranks: int, free: float
 ) -> str:
-    """What fits, as text: cells along the edges of a box, or of a mesh file in all."""
+    """Largest mesh that fits, as text: cells along the edges of a box, or of a mesh file in all."""
     box = scene.tissue.cells if _size_key(scene)[1] == "tissue.cells" else None
 
     def smaller(factor: float) -> list[int]:

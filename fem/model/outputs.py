@@ -84,7 +84,7 @@ def _node(system: BlockSystem, name: str, point: Array) -> Output:
 
 
 def _taken(system: BlockSystem, point: Array, where: Array) -> str:
-    """The node that stands for a point, and how many others are as near. Collective."""
+    """The node nearest to a point, and the number of others as near, in words. Collective."""
     layout = system.layout
     (least, equal), (nearer, _) = (layout.nearest_nodes(nodes, point) for nodes in (layout.nodes, layout.held))
     text = f"node {_coordinates(where)}"

@@ -1,4 +1,4 @@
-"""Scales of a model and of its displacements: what the gates of the effects are computed from."""
+"""Scales of a model and of its displacements, from which the gates of the effects are computed."""
 
 from __future__ import annotations
 

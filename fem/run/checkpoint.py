@@ -1,4 +1,4 @@
-"""Restart files: one file of arrays a rank, and a manifest written last that knows the SHA-256 of each."""
+"""Restart files: one file of arrays a rank, and a manifest, written last, with the SHA-256 of each."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def _write_manifest(state: RestartState, scene: Scene, manifest: Path, files: li
 
 
 def read_checkpoint(scene: Scene, layout: BlockLayout, directory: Path) -> RestartState:
-    """What a run of this scene left when it was stopped. Collective.
+    """State that a stopped run of this scene has written. Collective.
 
     Raises:
         CheckpointError: no restart file, a damaged one, or one of another scene, rank count, mesh numbering or format.
@@ -180,7 +180,7 @@ def _numbering(layout: BlockLayout) -> Array:
 
 
 def _numbers_hash(scene: Scene) -> str:
-    """Hash of what may change the numbers of a run."""
+    """Hash of all keys that may change the numbers of a run."""
     usual = type(scene.output)()
     output = scene.output.model_copy(update={key: getattr(usual, key) for key in FREE_OUTPUT})
     return scene_hash(scene.model_copy(update={"output": output}), FREE)

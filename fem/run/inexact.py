@@ -59,7 +59,7 @@ class InexactMidpoint(TissueMidpoint):
         self._scale(self._share())
 
     def _share(self) -> float:
-        """What w must be multiplied by for w'(r - S w) = 0. Collective."""
+        """Factor t with (t w)'(r - S t w) = 0 [1]. Collective."""
         square = self.w.dot(self.Sw)
         return float(self.w.dot(self.r) / square) if square > 0 else 1.0
 

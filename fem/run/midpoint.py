@@ -136,7 +136,7 @@ class TissueMidpoint:
         return ()
 
     def _prepare(self) -> None:
-        """Choose what ends a step. Collective."""
+        """Choose the update at the end of a step by the damping. Collective."""
         damping = self.system.damping
         self.alpha, self.beta = damping.alpha, damping.beta
         self.a = 2 * self.s / (self.s + self.alpha)
@@ -150,7 +150,7 @@ class TissueMidpoint:
             self._propagate = self._proportional
 
     def _picker(self) -> Callable[[], object]:
-        """What copies the owned rows of w to x."""
+        """Function that copies the owned rows of w to x."""
         layout, order = self.system.layout, self.operators.order
         if order is not None:
             w, x = (array.reshape(-1, order.d) for array in (self.w_array, self.x_array))
@@ -268,7 +268,7 @@ class TissueMidpoint:
         self.pending = self.c
 
     def pull(self) -> Array:
-        """G'w over the rows here, (n_s,), until the next call: the load l = G c of the step did the work 2 c'G'w."""
+        """G'w over the rows here, (n_s,), valid until the next call; the load G c of the step does the work 2 c'G'w."""
         self.coupling.multTranspose(self.w_here, self.moved)
         return self.moved_array
 
@@ -311,7 +311,7 @@ class TissueMidpoint:
         return float(total(self.system.layout.comm, local).sum()) / 2
 
     def over_ranks(self, share: float) -> float:
-        """Sum over the ranks of what each computed on the rows it holds, which may be all of them. Collective."""
+        """Sum over the ranks of a number that each computed on its rows here, which may be all rows. Collective."""
         return share if self.operators.whole else float(total(self.system.layout.comm, np.array([share]))[0])
 
     def residual(self) -> float:

@@ -118,7 +118,7 @@ class Run(Stepped):
         self.drive.solve(n, self.midpoint, self.state)
 
     def record(self, n: int) -> None:
-        """Store this rank's share of the outputs at step n, and what the work of the load needs."""
+        """Store this rank's share of the outputs at step n, and G'w for the work of the load."""
         self.pulls[n] = self.midpoint.pull()
         z = self.state.array
         for rows, share in self.points:
@@ -188,7 +188,7 @@ class Run(Stepped):
         return abs(defect) / scale if scale > 0 else 0.0
 
     def restart_state(self) -> RestartState:
-        """What this rank needs to go on from here; views, not copies."""
+        """State of this rank for a restart; views, not copies."""
         midpoint, n = self.midpoint, self.reached
         return RestartState(
             run=self.name,
@@ -270,7 +270,7 @@ class Run(Stepped):
 
 
 def frame_count(scene: Scene, n_e: int) -> int:
-    """Intervals between frames: ``output.frames``, or by size what a body of `LIGHT` unknowns fills with `FRAMES`."""
+    """Number of intervals between frames: ``output.frames``, or `FRAMES` to `LIGHT` unknowns, beyond like 1 / n_e."""
     frames = scene.output.frames
     return int(np.clip(FRAMES * LIGHT / n_e, FEWEST, FRAMES)) if frames == "auto" else frames
 

@@ -1,1 +1,1 @@
-"""What a scene says: its sections, its file, and the materials that ship."""
+"""The scene: its sections, its file, and the library of materials."""

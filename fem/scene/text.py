@@ -1,4 +1,4 @@
-"""Where text becomes values: the one place that bounds what a scene, a `--set` or a table of motion may hold.
+"""Text to values: the bounds on all entries of a scene, a `--set` or a table of motion.
 
 What passes can be squared, counted, drawn and written as a file name without a special case further on.
 """

@@ -31,7 +31,7 @@ def off(value: Any) -> Any:
 
 
 class OrFalse:
-    """In the JSON schema false stands where Python has None."""
+    """In the JSON schema false replaces Python's None."""
 
     def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         schema = handler(core)
@@ -91,7 +91,7 @@ class Material(Section):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """What a file may hold: a name of the library, or one of the two pairs of moduli."""
+        """Forms of a material in a file: a name of the library, or one of the two pairs of moduli."""
         reference = handler(core)
         schema = handler.resolve_ref_schema(reference)
         lame = dict(schema)

@@ -51,7 +51,7 @@ class Dissection:
 
     order: NodeOrder  # of the nodes
     before: tuple[NDArray[Any], NDArray[Any]]  # row pointers and columns of the blocks before
-    after: tuple[NDArray[Any], NDArray[Any]]  # the same in this order
+    after: tuple[NDArray[Any], NDArray[Any]]  # row pointers and columns of the blocks in this order
     source: NDArray[np.intp]  # where each block of ``after`` stood before
 
     def matrix(self, A: PETSc.Mat) -> PETSc.Mat:

@@ -16,7 +16,7 @@ PREFIX = "softgrasp_modes_"
 TOLERANCE = 1e-11  # of 1/omega^2 in the iteration; rounding in M-products is about 1e-15 n^(1/2)
 RESIDUAL = 1e-8  # bound on the relative error of omega^2 that is let pass
 KEPT_ENTRIES = 50_000_000  # of modes that stay with the system: 400 MB over all ranks
-ROUGH = 1e-3  # tolerance of the search for missed copies: enough when what is left lies ten times as far off
+ROUGH = 1e-3  # tolerance of the search for missed copies [1]: enough where others lie ten times as far away
 
 
 def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:

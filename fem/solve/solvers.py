@@ -177,7 +177,7 @@ class TissueSolver:
         return float(value)
 
     def check(self, r: PETSc.Vec, w: PETSc.Vec, where: str, size: float = 0.0) -> float:
-        """Raise unless S w = r is solved to the tolerance: direct solvers do not tell. Collective.
+        """Raise unless S w = r is solved to the tolerance: direct solvers do not report it. Collective.
 
         A direct solve with a larger residual passes when the correction of one refinement step, which is about its
         error, is small against w. Returns the relative residual. Raises SolverError: the iteration stopped early, or

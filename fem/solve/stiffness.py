@@ -1,4 +1,4 @@
-"""K_ee factored once for all who need it: equilibrium, sag, modes, estimate of the mesh."""
+"""K_ee factored once for all that need it: equilibrium, sag, modes, estimate of the mesh."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def factored_stiffness(
     rtol: float = 1e-12,
     reproducible: Reproducible = "auto",
 ) -> Iterator[TissueSolver]:
-    """K_ee, factored (or the set-up of cg and stars) by the first who asks, and kept while it is small. Collective.
+    """K_ee, factored (or the set-up of cg and stars) on the first request, and kept while it is small. Collective.
 
     Args:
         solver: None takes the one that suits few solves.

@@ -31,10 +31,14 @@ def compiled() -> Any:
 class Kernel:
     """Points of one rank, on a communicator of this rank alone, with their nodes.
 
-    ``lam``, ``mu``: in every point [Pa], (Q,); ``code``: from :func:`compiled`.
+    Args:
+        points: quadrature points, B on one rank.
+        lam: first Lame parameter of every point [Pa], (Q,).
+        mu: shear modulus of every point [Pa], (Q,).
+        code: interface and library of :func:`compiled`.
 
     Attributes:
-        J: det F at the end of the step tried last, (Q,).
+        J: det F at the end of the last trial step, (Q,) [1].
     """
 
     def __init__(self, points: QuadraturePoints, lam: Array, mu: Array, code: Any) -> None:
@@ -76,12 +80,16 @@ class Kernel:
 
 
 class HyperelasticBody:
-    """Points with materials; vectors have the distribution of the columns of B.
+    """Quadrature points with materials; vectors have the distribution of the columns of B.
 
-    ``pattern``: of the tangents; None: that of B'AB, which on some ranks has fewer columns of other ranks than K_ee.
+    Args:
+        points: quadrature points of the tissue.
+        materials: material of each layer.
+        pattern: matrix with the pattern of the tangents; None: that of B'AB, which on some ranks has fewer columns of
+            other ranks than K_ee.
 
     Attributes:
-        rounding: what rounding in the stress mu F leaves of a force [N], in the norm of all rows.
+        rounding: norm over all rows of the force that rounding in the stress mu F leaves [N].
     """
 
     def __init__(
@@ -188,7 +196,7 @@ class HyperelasticBody:
         self.points.B.multTranspose(self.h, f)
 
     def tangent(self, z: PETSc.Vec) -> PETSc.Mat:
-        """K(z) = B' (vol A) B with the pattern asked for; the next call overwrites it. Collective."""
+        """K(z) = B' (vol A) B with ``pattern``; the next call overwrites it. Collective."""
         d, Q = self.points.d, self.shape[2]
         moduli = self.law.tangent(self.gradient(z), self.lam, self.mu)
         moduli *= self.points.vol

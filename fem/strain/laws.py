@@ -106,7 +106,7 @@ class Law(ABC):
         """A = dP/dF [Pa], (d, d, d, d, Q) with A[i, J, k, L] = dP_iJ/dF_kL."""
 
     def start(self, H: Array) -> Start:
-        """What :meth:`step` needs of H_0."""
+        """Values at H_0 that :meth:`step` needs."""
         j = volume_change(H)
         with np.errstate(invalid="ignore", divide="ignore"):  # an inverted start is refused by its J
             return Start(H.copy(), j, np.log1p(j))

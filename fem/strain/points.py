@@ -21,14 +21,14 @@ Ints = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class QuadraturePoints:
-    """The points of this rank's cells."""
+    """The Q quadrature points of this rank's cells."""
 
-    # gradient, rows distributed as the points and columns as the tissue; of the rank's d^2 Q rows the row (i d + j) Q +
-    # q gives H_ij = dz_i/dX_j in its point q, so that H is an array (d, d, Q)
+    # gradient H = B z [1], rows distributed as the points and columns as the tissue; of the rank's d^2 Q rows the row
+    # (i d + j) Q + q is H_ij = dz_i/dX_j in its point q, so that H is an array (d, d, Q)
     B: PETSc.Mat
     # weight of each point [m^d, in 2D times the thickness], (Q,); they sum to the volume of the rank's cells
     vol: Array
-    layer: Ints  # number of the material of each point, (Q,)
+    layer: Ints  # number of the layer of each point, (Q,)
     cell: Ints  # global number of the cell of each point, (Q,)
     X: Array  # place of each point at rest [m], (Q, d)
     d: int  # space dimension
@@ -41,7 +41,7 @@ class QuadraturePoints:
         return LAWS[self.law]
 
     def lame(self, materials: tuple[LayerMaterial, ...]) -> tuple[Array, Array]:
-        """The numbers lam and mu of every point [Pa], (Q,) each."""
+        """Lame parameters lambda and mu of every point [Pa], (Q,) each."""
         lam, mu = (np.array([getattr(m, key) for m in materials]) for key in ("lam", "mu"))
         return lam[self.layer], mu[self.layer]
 
@@ -53,7 +53,7 @@ def make_gradient(comm: MPI.Intracomm, gradients: Array, nodes: Ints, columns: t
         gradients: dN_a/dX_j in every point of every cell, (cells, points, nodes, d).
         nodes: global number of each cell's nodes among the free ones, negative for nodes that follow the hand,
             (cells, nodes).
-        columns: rows of the tissue on this rank and in all.
+        columns: number of tissue unknowns on this rank and on all [1].
     """
     cells, each, _, d = gradients.shape
     Q = cells * each

@@ -39,16 +39,13 @@ class Basis:
 
     name: str  # key in the registry
     layout: BlockLayout  # sizes and ownership
-    # V_sq, V_sv: rows of the hand, (n_s, N), the same on every rank
-    V_sq: Array
-    V_sv: Array
-    # V_q, V_p: local rows of the tissue, (n_local, N): displacement, and velocity or momentum
-    V_q: Array
-    V_p: Array
-    # coordinates, frame, structure: see above
-    coordinates: Coordinates = "qv"
-    frame: Frame = "absolute"
-    structure: Structure = "none"
+    V_sq: Array  # displacement of the hand, (n_s, N), the same on every rank
+    V_sv: Array  # velocity or momentum of the hand, (n_s, N), the same on every rank
+    V_q: Array  # displacement of the tissue, local rows (n_local, N)
+    V_p: Array  # velocity or momentum of the tissue, local rows (n_local, N)
+    coordinates: Coordinates = "qv"  # "qv" with velocities, "qp" with momenta
+    frame: Frame = "absolute"  # of the tissue rows: absolute, or relative to the rigid motion of the hand
+    structure: Structure = "none"  # that V or its tissue columns keep
     fixed_solid: bool = False  # the first 2 n_s columns are the hand's own unit vectors
     # inner product it was built in, see `reduction/bases/inner.py`
     inner: Literal["euclidean", "mass", "energy"] = "euclidean"

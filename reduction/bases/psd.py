@@ -35,8 +35,8 @@ class Canonical:
     by: Weight | None  # the weight A, or None
     factor: Factor  # Q and R = [R_q, R_y]
     inverse: Array | None  # L^-T, or None
-    C_q: Array  # C_q, C_y: small coordinates, (r, m), on every rank
-    C_y: Array
+    C_q: Array  # coordinates of q~, (r, m), on every rank
+    C_y: Array  # coordinates of y~, (r, m), on every rank
     rate: float  # c
     scale: float  # power of two taken out of the snapshots
     momenta: bool  # whether V_p needs the factor A (canonical coordinates)

@@ -46,10 +46,9 @@ class Method:
     paper: str | None  # what the paper calls it, None for those beyond it
     preserving: bool  # the reduced model keeps the Hamiltonian or the second-order structure
     build: Callable[[PartsRequest], tuple[Part, ...]]  # makes the parts from the snapshots
-    # coordinates, frame, structure: of the basis, see :class:`softgrasp.reduction.bases.basis.Basis`
-    coordinates: Coordinates
-    frame: Frame
-    structure: Structure
+    coordinates: Coordinates  # "qv" with velocities, "qp" with momenta
+    frame: Frame  # of the tissue rows: absolute, or relative to the rigid motion of the hand
+    structure: Structure  # that V or its tissue columns keep
     fixed: bool  # the hand's unit columns are kept apart from the decomposition
     pairs: bool  # units are pairs of columns, so N is even
     snapshots: bool = True  # whether it needs any

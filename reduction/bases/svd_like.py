@@ -20,15 +20,15 @@ LONGEST = 200.0  # |s|^2 + |t|^2
 DROP = 0.1  # directions without partner are taken together down to this share of the largest
 
 
-def poisson(Y: Array) -> Array:
+def apply_j(Y: Array) -> Array:
     """J Y for rows (q; p), J = [0 I; -I 0]."""
     q, p = np.split(Y, 2)
     return np.vstack([p, -q])
 
 
-def form(X: Array, Y: Array) -> Array:
+def symplectic_form(X: Array, Y: Array) -> Array:
     """X' J Y."""
-    return X.T @ poisson(Y)
+    return X.T @ apply_j(Y)
 
 
 def svd_like_pairs(
@@ -59,7 +59,7 @@ def _pairs(X: Array, limit: int | None, share: float | None) -> tuple[Array, Arr
     q, p = np.linalg.norm(X[:r]), np.linalg.norm(X[r:])
     ratio = float(q / p) ** 0.5 if q > 0 and p > 0 else 1.0
     units = np.repeat([ratio, 1 / ratio], r)[:, None]
-    pool = _Pool(X / units, lambda Y: np.linalg.norm(units * Y, axis=0))
+    pool = _PairSelection(X / units, lambda Y: np.linalg.norm(units * Y, axis=0))
     pool.collect(limit, share)
     S, T = balanced(units * pool.S, units * pool.T)
     order = np.argsort(-pool.weights, kind="stable")
@@ -68,8 +68,8 @@ def _pairs(X: Array, limit: int | None, share: float | None) -> tuple[Array, Arr
     return np.hstack([S[:, order], T[:, order]]), pool.weights[order]
 
 
-class _Pool:
-    """Pairs found so far and what is left of X; ``norms`` measures columns in the units of X."""
+class _PairSelection:
+    """Symplectic pairs found so far and the remainder of X; ``norms`` measures columns in the units of X."""
 
     def __init__(self, X: Array, norms: Callable[[Array], Array]) -> None:
         self.norms = norms
@@ -117,7 +117,7 @@ class _Pool:
 
     def _stage(self) -> bool:
         """Add the hyperbolic pairs of the rest that are large and well conditioned; whether there were any."""
-        B = form(self.rest, self.rest)
+        B = symplectic_form(self.rest, self.rest)
         # i B is Hermitian; for an eigenvalue lambda > 0, u = (b + i a) / sqrt(2) gives a'Bb = lambda, a, b orthonormal
         # +-lambda come in pairs, so that the largest is at least |B|_F / sqrt(columns): vectors of fewer are made
         least = STAGE * float(np.linalg.norm(B)) / max(len(B), 1) ** 0.5
@@ -140,10 +140,10 @@ class _Pool:
         room = (len(self.S) - 2 * self.S.shape[1]) // 2
         k = min(int(np.count_nonzero(self.s > DROP * self.size)), room)
         U, s = self.U[:, :k], self.s[:k]
-        T = -poisson(U)  # J' U, for which U'JT = U'U = I
+        T = -apply_j(U)  # J' U, for which U'JT = U'U = I
         for _ in range(2):
             T = self._complement(T)
-        T = T + U @ form(T, T) / 2  # now T'JT = 0 up to U'JU
+        T = T + U @ symplectic_form(T, T) / 2  # now T'JT = 0 up to U'JU
         S, T = np.hsplit(_symplectic(np.hstack([U, T])), 2)
         self._add(S, T, s * self.norms(U))
 
@@ -157,7 +157,7 @@ class _Pool:
 
     def _complement(self, Y: Array) -> Array:
         """(I - S S^+) Y."""
-        return Y - self.T @ form(self.S, Y) + self.S @ form(self.T, Y)
+        return Y - self.T @ symplectic_form(self.S, Y) + self.S @ symplectic_form(self.T, Y)
 
 
 def symplectic_repair(B: Array) -> Array:
@@ -166,7 +166,7 @@ def symplectic_repair(B: Array) -> Array:
     Raises BasisError: B is singular, far from J.
     """
     try:
-        return np.linalg.inv(np.real(scipy.linalg.sqrtm(-poisson(B))))
+        return np.linalg.inv(np.real(scipy.linalg.sqrtm(-apply_j(B))))
     except np.linalg.LinAlgError as error:
         raise BasisError(
             "SVD-like pairs of these snapshots are linearly dependent to rounding; take a smaller N or another basis"
@@ -178,7 +178,7 @@ def _symplectic(S: Array) -> Array:
     k = S.shape[1] // 2
     J = np.eye(2 * k, k=k) - np.eye(2 * k, k=-k)
     for _ in range(3):
-        B = form(S, S)
+        B = symplectic_form(S, S)
         if np.abs(B - J).max(initial=0.0) < 4 * EPS:
             break
         S = S @ symplectic_repair(B)

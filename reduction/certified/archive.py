@@ -18,9 +18,11 @@ from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import Profile
 from softgrasp.reduction.archive import LINEAR, about, read_linear, reading, write_model, write_small
-from softgrasp.reduction.certified.certificate import MeshNumber
-from softgrasp.reduction.certified.model import Box, CertifiedModel
+from softgrasp.reduction.certified.certificate import OfflineMeshEstimate
+from softgrasp.reduction.certified.dual import OutputDuals
+from softgrasp.reduction.certified.model import CertifiedModel, ParameterDomain
 from softgrasp.reduction.certified.motion import Drive
+from softgrasp.reduction.certified.oscillators import SecondOrder
 from softgrasp.reduction.certified.residual import ResidualNorms
 from softgrasp.reduction.model import ModelError
 
@@ -43,13 +45,13 @@ def save_certified(model: CertifiedModel, path: str | Path) -> None:
 
 
 def _write(model: CertifiedModel, group: h5py.Group) -> None:
-    norms, mesh = model.norms, model.mesh
+    norms, mesh, box = model.norms, model.mesh, model.box
     data = {
         "k": model.k,
         "certify": model.certify,
         "tolerance": model.tolerance,
         "norm": model.norm,
-        "box": None if model.box is None else asdict(model.box),
+        "box": None if box is None else {"lam": box.lam, "mu": box.mu, "apart": box.independent_layers},
         "mesh": None if mesh is None else asdict(mesh),
         "reference": [asdict(m) for m in norms.reference],
         "n_s": norms.n_s,
@@ -62,6 +64,10 @@ def _write(model: CertifiedModel, group: h5py.Group) -> None:
     group["static"], group["mass"], group["compliance"] = norms.static, norms.mass, model.compliance
     for i, T in enumerate(norms.shape or ()):
         group[f"shape/{i}"] = T
+    if model.duals is not None:
+        for key, value in vars(model.duals.blocks).items():
+            group[f"duals/{key}"] = value
+        group["duals/C"], group["duals/triangle"] = model.duals.C, model.duals.triangle
     drive, name = model.drive, "drive"
     while drive is not None:
         part = group.create_group(name)
@@ -112,7 +118,12 @@ def _read(group: h5py.Group) -> dict[str, Any]:
     shape = (group["shape/0"][()], group["shape/1"][()]) if "shape" in group else None
     static, mass, compliance = (group[name][()] for name in ("static", "mass", "compliance"))
     data = json.loads(group["about"][()].tobytes())
-    return {**_about(data, static, mass, shape), "compliance": compliance, "drive": drive}
+    duals = None
+    if "duals" in group:
+        arrays = {key: value[()] for key, value in group["duals"].items()}
+        C, triangle = arrays.pop("C"), arrays.pop("triangle")
+        duals = OutputDuals(SecondOrder(**arrays), C, triangle)
+    return {**_about(data, static, mass, shape), "compliance": compliance, "drive": drive, "duals": duals}
 
 
 def _about(data: dict[str, Any], static: Array, mass: Array, shape: tuple[Array, Array] | None) -> dict[str, Any]:
@@ -121,9 +132,9 @@ def _about(data: dict[str, Any], static: Array, mass: Array, shape: tuple[Array,
     norms = ResidualNorms(static, mass, reference, data["n_s"], data["dimension"], (low, high), shape)
     mesh, box = data["mesh"], data["box"]
     if mesh is not None:
-        mesh = MeshNumber(tuple((a, b) for a, b in mesh["places"]), tuple(mesh["estimates"]))
+        mesh = OfflineMeshEstimate(tuple((a, b) for a, b in mesh["places"]), tuple(mesh["estimates"]))
     if box is not None:
-        box = Box(tuple(box["lam"]), tuple(box["mu"]), box["apart"])
+        box = ParameterDomain(tuple(box["lam"]), tuple(box["mu"]), box["apart"])
     kept = {key: data[key] for key in ("k", "certify", "tolerance", "norm", "training")}
     return {**kept, "norms": norms, "box": box, "mesh": mesh}
 

@@ -24,13 +24,13 @@ SAFETY = 1.01  # of the kernel: its maximum is taken on a grid
 GAIN = 1.0  # decay over the run, in powers of e, from which a kernel is worth its cost
 
 
-def nodal(rows: Array, first: Array | None = None, nodes: Array | None = None) -> tuple[Array, Array]:
-    """Means of neighbouring middles, (w, steps + 1), ``first`` at the start; and what their means leave of the middles.
+def node_average(rows: Array, first: Array | None = None, nodes: Array | None = None) -> tuple[Array, Array]:
+    """Node values by averaging neighbouring midpoint values, (w, steps + 1), and the remainder at the midpoints.
 
     Args:
-        rows: values at the middles, (w, steps).
-        first: (w,); None takes the first middle.
-        nodes: where the means go; None makes room for them.
+        rows: values at the midpoints, (w, steps).
+        first: node value at the start, (w,); None takes the first midpoint value.
+        nodes: array for the node values; None makes one.
     """
     nodes = np.empty((len(rows), rows.shape[1] + 1)) if nodes is None else nodes
     nodes[:, 0] = rows[:, 0] if first is None else first

@@ -12,6 +12,8 @@ from softgrasp.fem.petsc import Array
 from softgrasp.reduction.online import ReducedTrajectory
 
 Kind = Literal["proof", "estimate"]
+NORMS = {"energy": "largest energy norm of the deformation", "output": "largest deformation at the outputs"}
+"""What the error of the reduction is relative to, by ``reduction.norm``."""
 
 
 class ToleranceError(SoftgraspError):
@@ -31,7 +33,7 @@ class Bound:
     """Error of a run at every step."""
 
     values: Array = field(repr=False)  # at every step, (steps + 1,) or one column for each component
-    size: float  # largest value of the reduced solution itself, in the same norm
+    size: float  # largest value of the reduced solution itself, in the norm of the error
     kind: Kind  # "proof": not exceeded; "estimate": about so large
 
     @property
@@ -45,14 +47,14 @@ class Bound:
 
         Infinite when the proof is larger than the reduced solution, 0 when nothing moves.
         """
-        off = float(np.linalg.norm(self.largest))
-        least = self.size - off if self.kind == "proof" else self.size
-        return 0.0 if off == 0 else off / least if least > 0 else float("inf")
+        error = float(np.linalg.norm(self.largest))
+        least = self.size - error if self.kind == "proof" else self.size
+        return 0.0 if error == 0 else error / least if least > 0 else float("inf")
 
 
 @dataclass(frozen=True)
-class MeshNumber:
-    """What the mesh leaves in the deformation of the outputs, estimated offline; no bound."""
+class OfflineMeshEstimate:
+    """Error of the mesh in the deformation of the outputs, estimated offline; no bound."""
 
     places: tuple[tuple[float, float], ...]  # (lambda, mu) of the first layer where it was estimated [Pa]
     estimates: tuple[float, ...]  # relative error there, as large as that of full runs to 1 % on the paper's scene [1]
@@ -65,19 +67,20 @@ class MeshNumber:
 
 @dataclass(frozen=True)
 class Certificate:
-    """Errors of one reduced run, apart by their sources: reduction, time step, mesh.
+    """Errors of one reduced run, separated by their sources: reduction, time step, mesh.
 
     Attributes:
         energy: of the deformation in the energy norm, |e|^2 = e_z'K e_z + e_v'M e_v [J^(1/2)]; for a hand that a force
             drives with the tissue pulling back, of deformation and hand, e_v with the hand's velocity.
         outputs: proof for every output component [m, rad].
-        estimate, outputs_estimate: difference to the run of the larger basis; None without one.
+        estimate: difference to the run of the larger basis in the energy norm; None without one.
+        outputs_estimate: difference to the run of the larger basis at every output [m, rad]; None without one.
         effectivity_at_most: of the proof's running maximum, as far as the numbers themselves prove it; infinite if they
             do not.
         time_step: estimate of the error of the step, relative, in the energy norm; None where no finer table of the
             motion was given.
-        time_step_proof: the same with the bounds of both runs added; None if not asked for.
-        mesh: what is known of the mesh's error; None: nothing.
+        time_step_proof: :attr:`time_step` with the bounds of both runs added; None if not asked for.
+        mesh: estimate of the error of the mesh; None: not known.
         inside: the materials lie in the box that the model was trained in.
         norm: what :attr:`reduction` is about: "energy" or "output".
         tolerance: asked for; None: none.
@@ -90,7 +93,7 @@ class Certificate:
     effectivity_at_most: float = np.inf
     time_step: float | None = None
     time_step_proof: float | None = None
-    mesh: MeshNumber | None = None
+    mesh: OfflineMeshEstimate | None = None
     inside: bool = True
     norm: str = "energy"
     tolerance: float | None = None
@@ -108,7 +111,7 @@ class Certificate:
     @property
     def what(self) -> str:
         """What :attr:`reduction` is relative to, in words."""
-        return "largest energy norm" if self.norm == "energy" else "largest deformation at the outputs"
+        return NORMS[self.norm]
 
     @property
     def reduction(self) -> float:

@@ -1,7 +1,7 @@
 """The lazy POD-Greedy [HO08]: train where the bound is largest, until it is below a tolerance everywhere on a grid.
 
-Bounds hardly ever grow with the basis, so old values of the bound tell where it need not be looked at again: only
-points that could be the largest are evaluated anew. Nothing here knows what is trained.
+Bounds hardly ever grow with the basis, so that old values of the bound are nearly upper bounds: only points that could
+be the largest are evaluated again. Nothing here depends on what is trained.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ STALLED, GAIN = 3, 0.99  # rounds without the largest bound falling below this s
 
 
 @dataclass(frozen=True)
-class Round:
+class GreedyStep:
     """One step of the greedy."""
 
-    at: int  # number of the point that was trained
-    k: int  # modes afterwards
+    at: int  # number of the trained point
+    k: int  # number of modes afterwards
     bound: float  # largest relative bound on the grid afterwards
-    worst: int  # number of the point that has it
-    evaluations: int  # bounds computed so far
-    seconds: float  # since the start, resumed runs without the pause
+    worst: int  # number of the point with the largest bound
+    evaluations: int  # number of bounds computed so far
+    seconds: float  # time since the start, without the pause of resumed runs [s]
 
 
 @dataclass(frozen=True)
 class Greedy:
     """State of a greedy after some rounds; enough to go on from, together with the basis."""
 
-    rounds: tuple[Round, ...]  # so far
+    rounds: tuple[GreedyStep, ...]  # steps so far
     known: Array  # last known bound of every point, infinite where there is none, (points,)
-    reason: str = ""  # why it stopped; empty while it goes on
+    reason: str = ""  # key of :data:`REASONS` for the stop; empty while it goes on
 
     @property
     def reached(self) -> bool:
@@ -89,7 +89,7 @@ def greedy(
             fresh[todo] = True
             evaluations += len(todo)
         worst = int(order[0])
-        rounds.append(Round(at, more, float(known[worst]), worst, evaluations, time.perf_counter() - begin))
+        rounds.append(GreedyStep(at, more, float(known[worst]), worst, evaluations, time.perf_counter() - begin))
         reason = _reason(rounds[since:], tolerance, more == k, more >= most)
         at, k = worst, more
         progress(Greedy(tuple(rounds), known.copy(), reason))
@@ -101,7 +101,7 @@ def start(points: int) -> Greedy:
     return Greedy((), np.full(points, np.inf))
 
 
-def _reason(rounds: Sequence[Round], tolerance: float, nothing: bool, full: bool) -> str:
+def _reason(rounds: Sequence[GreedyStep], tolerance: float, nothing: bool, full: bool) -> str:
     values = [r.bound for r in rounds]
     if values[-1] <= tolerance:
         return "tolerance"

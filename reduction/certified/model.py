@@ -17,7 +17,14 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.certified import bounds
-from softgrasp.reduction.certified.certificate import Bound, Certificate, CertifiedRun, MeshNumber, ToleranceError
+from softgrasp.reduction.certified.certificate import (
+    Bound,
+    Certificate,
+    CertifiedRun,
+    OfflineMeshEstimate,
+    ToleranceError,
+)
+from softgrasp.reduction.certified.dual import OutputDuals, corrected
 from softgrasp.reduction.certified.motion import (
     Drive,
     Materials,
@@ -38,15 +45,12 @@ TOGETHER = 4_000_000  # entries of the states of a batch that march at once: 32 
 
 
 @dataclass(frozen=True)
-class Box:
-    """Ranges of lambda and mu of the first layer [Pa], at its density in the projection.
+class ParameterDomain:
+    """Ranges of lambda and mu for which a model was trained, at the densities of the projection."""
 
-    The other layers keep their ratios to it, or, ``apart``, each has the same factors for itself.
-    """
-
-    lam: tuple[float, float]
-    mu: tuple[float, float]
-    apart: bool = False
+    lam: tuple[float, float]  # least and largest lambda of the first layer [Pa]
+    mu: tuple[float, float]  # least and largest mu of the first layer [Pa]
+    independent_layers: bool = False  # every layer varies by itself within these factors; else all keep their ratios
 
 
 @dataclass(frozen=True)
@@ -65,19 +69,21 @@ class CertifiedModel:
         mesh: error of the mesh at some parameters.
         drive: the motion of the scene.
         training: what the greedy did, for archive and reports.
+        duals: of the outputs, for sharper bounds on them; None: the bound of the energy norm alone.
     """
 
     fine: ReducedModel
     k: int
     norms: ResidualNorms
     compliance: Array
-    box: Box | None = None
+    box: ParameterDomain | None = None
     tolerance: float | None = None
     certify: Certify = "two"
     norm: str = "energy"
-    mesh: MeshNumber | None = None
+    mesh: OfflineMeshEstimate | None = None
     drive: Drive | None = None
     training: dict[str, Any] = field(default_factory=dict)
+    duals: OutputDuals | None = None
 
     def __post_init__(self) -> None:
         fine, k2, second = self.fine, self.norms.k, self.fine.structure == "second_order"
@@ -97,8 +103,9 @@ class CertifiedModel:
 
     def with_sizes(self, k: int, k2: int) -> CertifiedModel:
         """The same with fewer modes in both bases: leading blocks, no new work."""
-        fine = self.fine if k2 == self.k2 else leading(self.fine, k2)
-        return replace(self, fine=fine, k=k, norms=self.norms.leading(k2))
+        if k2 == self.k2:
+            return replace(self, k=k)
+        return replace(self, fine=leading(self.fine, k2), k=k, norms=self.norms.leading(k2), duals=None)
 
     @cached_property
     def coarse(self) -> ReducedModel:
@@ -121,7 +128,7 @@ class CertifiedModel:
             return True
         own, first = self.fine.materials, self.fine.materials[0]
         ratios = [(m.lam / o.lam, m.mu / o.mu, m.rho / o.rho) for m, o in zip(materials, own, strict=True)]
-        alike = slice(2 if self.box.apart else 0, 3)
+        alike = slice(2 if self.box.independent_layers else 0, 3)
         near = all(isclose(x, y) for r in ratios for x, y in list(zip(r, ratios[0], strict=True))[alike])
         near = near and all(isclose(m.beta, o.beta) for m, o in zip(materials, own, strict=True))
         limits = [
@@ -194,8 +201,8 @@ class CertifiedModel:
             for materials, answer, certificate in self._certified(many[at : at + chunk], drive, g):
                 if prove_time_step and drive.finer is not None and certificate.time_step is not None:
                     ((_, _, finer),) = self._certified([materials], replace(drive.finer, finer=None), g)
-                    off = certificate.energy.largest + finer.energy.largest
-                    proof = certificate.time_step + float(off) / certificate.energy.size
+                    both = certificate.energy.largest + finer.energy.largest
+                    proof = certificate.time_step + float(both) / certificate.energy.size
                     certificate = replace(certificate, time_step_proof=proof)
                 certificate = replace(certificate, tolerance=tolerance, mesh=self.mesh, norm=self.norm)
                 runs.append(CertifiedRun(answer.trajectory(drive.dt, self.fine.outputs.names), certificate))
@@ -222,17 +229,17 @@ class CertifiedModel:
             refined = list(self._motions(self.k, many, drive.finer, g, False))
         result = []
         for materials, answer, fine, finer in zip(many, answers, fines, refined, strict=True):
-            certificate = self._certificate(materials, answer, fine, drive)
+            certificate = self._certificate(materials, answer, fine, drive, g)
             if finer is not None and drive.finer is not None:
                 step = self._time_step(materials, answer, finer, drive, drive.finer)
                 certificate = replace(certificate, time_step=step)
             result.append((materials, answer, certificate))
         return result
 
-    def _certificate(self, materials: Materials, answer: Motion, fine: Motion, drive: Drive) -> Certificate:
+    def _certificate(self, materials: Materials, answer: Motion, fine: Motion, drive: Drive, g: Array) -> Certificate:
         size, rigid = answer.size, answer.q_s @ self.fine.outputs.C_s.T
         deformation = float(bounds.lengths((answer.outputs - rigid).T).max())
-        estimate = wide = None
+        estimate = wide = sharper = None
         if fine is not answer:
             estimate = Bound(self._difference(materials, answer, fine, drive), size, "estimate")
             wide = Bound(np.abs(fine.outputs - answer.outputs), deformation, "estimate")
@@ -240,13 +247,19 @@ class CertifiedModel:
         if self.certify == "estimate" and estimate is not None and wide is not None:
             return Certificate(estimate, wide, inside=inside)
         own = self._bound(fine, materials, drive)
-        reach = self._reach(own, materials, drive)
+        outputs = self._output_bound(own, materials, drive)
+        if self.duals is not None and fine.modes is not None:
+            compliance, most = self.norms.static_factor(materials) * self.compliance, outputs.max(axis=0)
+            sharper = corrected(self.duals, self.fine, self.norms, fine, materials, drive, g, compliance, most)
+        outputs += 0.0 if wide is None else wide.values
+        if sharper is not None:
+            outputs = np.minimum(outputs, np.abs(fine.outputs + sharper[0] - answer.outputs) + sharper[1])
         effectivity = np.inf
         if estimate is not None and estimate.largest > own.max():
             effectivity = float((estimate.largest + own.max()) / (estimate.largest - own.max()))
         return Certificate(
             energy=Bound(own if estimate is None else estimate.values + own, size, "proof"),
-            outputs=Bound(reach if wide is None else wide.values + reach, deformation, "proof"),
+            outputs=Bound(outputs, deformation, "proof"),
             estimate=estimate,
             outputs_estimate=wide,
             effectivity_at_most=effectivity,
@@ -285,7 +298,7 @@ class CertifiedModel:
         drift, gap, start = r.inexact or (None, None, 0.0)
         return bounds.static_bound(r.nodes, r.rest, drive.dt, drive.start == "equilibrium", kernel, drift, gap, start)
 
-    def _reach(self, bound: Array, materials: Materials, drive: Drive) -> Array:
+    def _output_bound(self, bound: Array, materials: Materials, drive: Drive) -> Array:
         """Bound of every output component from one of the energy, (steps + 1, p)."""
         reach = bound[:, None] * (self.norms.static_factor(materials) * self.compliance)
         if self._coupled(drive):
@@ -302,10 +315,10 @@ class CertifiedModel:
             return 0.0
         if finer.w is not None and answer.w is not None:
             d = finer.w[:, :, ::many] - answer.w
-            off = bounds.lengths(d.reshape(-1, d.shape[2]))
+            error = bounds.lengths(d.reshape(-1, d.shape[2]))
         else:
             x = finer.states(fine_drive.dt)[::many] - answer.states(drive.dt)
             if not self._coupled(drive):
                 x[:, : 2 * answer.q_s.shape[1]] = 0.0
-            off = self._energy(self.coarse, materials, x, drive)
-        return float(off.max() / answer.size * many**2 / (many**2 - 1))
+            error = self._energy(self.coarse, materials, x, drive)
+        return float(error.max() / answer.size * many**2 / (many**2 - 1))

@@ -13,7 +13,7 @@ from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import Profile, driven_table
 from softgrasp.reduction import online
-from softgrasp.reduction.certified.bounds import lengths, nodal
+from softgrasp.reduction.certified.bounds import lengths, node_average
 from softgrasp.reduction.certified.oscillators import Modes, SecondOrder, march
 from softgrasp.reduction.certified.residual import ResidualNorms
 from softgrasp.reduction.model import ModelError, Outputs, ReducedModel
@@ -22,19 +22,19 @@ from softgrasp.reduction.propagator import propagator
 
 Materials = tuple[LayerMaterial, ...]
 Start = Literal["rest", "equilibrium"]
-FINER = 8  # steps for one, of the runs that tell the error of the step
+FINER = 8  # steps for one, of the runs that estimate the error of the step
 SLOW = 0.25  # angle of a mode in a step below which smoothing its residual gains about 1 % of the bound
 
 
 @dataclass(frozen=True)
 class Drive:
-    """What moves the hand: tables of its motion at the steps, or of the force on it at their middles."""
+    """What moves the hand: tables of its motion at the steps, or of the force on it at their midpoints."""
 
     dt: float  # step [s]
     hand: tuple[Array, Array] | None = None  # q_s and v_s, (steps + 1, n_s) each [m, rad; m/s, rad/s]
     force: Array | None = None  # u, (steps, n_s) [N, N m]
     start: Start = "rest"  # "rest", or "equilibrium" under gravity
-    finer: Drive | None = None  # the same motion at a step some times smaller, for the error of the step
+    finer: Drive | None = None  # this motion at a step several times smaller, for the error of the step
     profile: Profile | None = None  # the time law behind the tables; None: not known
 
     @staticmethod
@@ -64,26 +64,25 @@ class Drive:
 
 @dataclass(frozen=True)
 class Residual:
-    """What the static bound takes of a run, see :func:`softgrasp.reduction.certified.bounds.static_bound`."""
+    """Residual of a run as the static bound needs it, see :func:`softgrasp.reduction.certified.bounds.static_bound`."""
 
     nodes: Array  # T r^ in K^-1 at the steps, (w, steps + 1)
     rest: Array  # |r - mean r^|_{M^-1}, (steps,)
-    # drift (steps,), gap (steps + 1,) and start, where the kinematics are not exact
-    inexact: tuple[Array, Array, float] | None = None
+    inexact: tuple[Array, Array, float] | None = None  # drift (steps,), gap (steps + 1,), start of inexact kinematics
 
 
 @dataclass(frozen=True)
 class Motion:
     """One run of one basis."""
 
-    q_s: Array  # q_s, v_s: hand, (steps + 1, n_s)
-    v_s: Array
+    q_s: Array  # displacement of the hand, (steps + 1, n_s) [m, rad]
+    v_s: Array  # velocity of the hand, (steps + 1, n_s) [m/s, rad/s]
     outputs: Array  # (steps + 1, p) [m, rad]
     size: float  # largest energy norm
     residual: Residual | None  # None where it was not asked for
-    modes: Modes | None = None  # modes, w: modes, and states (k, 2, steps + 1) in them; or
-    w: Array | None = None
-    x: Array | None = None  # states (steps + 1, N)
+    modes: Modes | None = None  # modes of the run; None where it was not made mode by mode
+    w: Array | None = None  # states in the modes, (k, 2, steps + 1); None without modes
+    x: Array | None = None  # states x, (steps + 1, N); None with modes
 
     def states(self, dt: float) -> Array:
         """States x = [q_s, v_s, a, b], (steps + 1, N)."""
@@ -147,7 +146,7 @@ def known_hand(model: ReducedModel, drive: Drive, gravity: Array) -> tuple[Array
 
 
 def load_rows(model: ReducedModel, v: Array, dt: float, g: Array) -> Array:
-    """Load c = a_s - g [+ alpha v_s] at the middles, (n_s, steps)."""
+    """Load c = a_s - g [+ alpha v_s] at the midpoints, (n_s, steps)."""
     c = np.diff(v, axis=0).T / dt - g[:, None]
     if model.in_space:
         c += model.alpha * (v[1:] + v[:-1]).T / 2
@@ -200,7 +199,7 @@ def modal_residual(
         y: (k, steps + 1).
         c: (n_s, steps).
         c_0: at a start in equilibrium, (n_s,); else None.
-        dt: step [s]; modes that turn by less than :data:`SLOW` in it are not smoothed and leave nothing at the middles.
+        dt: step [s]; modes that turn by less than :data:`SLOW` in it are not smoothed: no remainder at the midpoints.
     """
     slow, n_s, k = int(np.searchsorted(m.omega * dt, SLOW)), len(c), len(y)
     norms = norms.galerkin
@@ -212,11 +211,11 @@ def modal_residual(
         np.triu(scipy.linalg.lapack.dgeqrf(A)[0][: A.shape[1]])
         for A in (columns[: len(norms.static)], columns[len(norms.static) :, slow:])
     )
-    middles, steps = np.empty((n_s + k - slow, c.shape[1])), np.empty((n_s + k, y.shape[1]))
-    middles[:n_s], steps[:slow] = c, y[:slow]
-    np.add(y[slow:, 1:], y[slow:, :-1], out=middles[n_s:])
-    middles[n_s:] *= 0.5
-    _, left = nodal(middles, None if c_0 is None else np.concatenate([c_0, y[slow:, 0]]), steps[slow:])
+    midpoints, steps = np.empty((n_s + k - slow, c.shape[1])), np.empty((n_s + k, y.shape[1]))
+    midpoints[:n_s], steps[:slow] = c, y[:slow]
+    np.add(y[slow:, 1:], y[slow:, :-1], out=midpoints[n_s:])
+    midpoints[n_s:] *= 0.5
+    _, left = node_average(midpoints, None if c_0 is None else np.concatenate([c_0, y[slow:, 0]]), steps[slow:])
     rest = norms.mass_factor(materials) * lengths(mass @ left)
     return Residual((norms.static_factor(materials) * static) @ steps, rest)
 
@@ -262,7 +261,7 @@ def stepped_residual(
     first = None
     if drive.start == "equilibrium":
         first = np.concatenate([-g, np.zeros(len(b)), a[:, 0], np.zeros(len(b))])
-    nodes, left = nodal(rows, first)
+    nodes, left = node_average(rows, first)
     static = norms.static_factor(materials) * np.linalg.qr(np.hstack(norms.columns("static", materials)), mode="r")
     mass = norms.mass_factor(materials) * np.hstack(norms.columns("mass", materials))
     if model.two_way and drive.hand is None:

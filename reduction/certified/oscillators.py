@@ -30,8 +30,8 @@ class Modes:
     X: Array  # (k, k), X' M X = 1
     inverse: Array  # X^-1 = X' M
     g: Array  # X'G, (k, n_s)
-    alpha: float  # alpha, beta: damping [1/s, s]
-    beta: float
+    alpha: float  # mass-proportional damping [1/s]
+    beta: float  # stiffness-proportional damping [s]
 
     @property
     def rate(self) -> Array:
@@ -41,12 +41,12 @@ class Modes:
 
 @dataclass(frozen=True)
 class SecondOrder:
-    """Reduced M, K and G of every layer at unit materials, (L, k, k) and (L, k, n_s); all of a second-order model."""
+    """Reduced matrices of every layer at unit materials: a whole second-order model."""
 
-    K_mu: Array
-    K_lambda: Array
-    M: Array
-    G: Array
+    K_mu: Array  # stiffness at mu = 1 Pa, lambda = 0, (L, k, k)
+    K_lambda: Array  # stiffness at lambda = 1 Pa, mu = 0, (L, k, k)
+    M: Array  # mass at rho = 1 kg/m^3, (L, k, k)
+    G: Array  # coupling to the hand at rho = 1 kg/m^3, (L, k, n_s)
 
     @staticmethod
     def of(model: ReducedModel) -> SecondOrder:
@@ -77,8 +77,9 @@ def march(omega: Array, rate: Array, loads: Array, dt: float, start: Array | Non
     """Midpoint steps of eta'' + rate eta' + omega^2 eta = f for many modes; w = (omega eta, eta').
 
     Args:
-        omega, rate: (m,).
-        loads: f at the middles of the steps, (m, steps).
+        omega: angular frequency of every mode, (m,) [1/s].
+        rate: damping of every mode, (m,) [1/s].
+        loads: f at the midpoints of the steps, (m, steps).
         dt: step [s].
         start: w at the start, (m, 2); None is zero.
 

@@ -38,14 +38,13 @@ MARGIN = 1.01  # of the largest frequency, which the iteration meets from below
 class ResidualNorms:
     """Triangles of the columns [G_1 of every layer; M_1 phi, K_mu phi, K_lambda phi of every layer, mode by mode]."""
 
-    static: Array  # in K_r^-1, (rows, L n_s + 3 L k)
-    mass: Array  # in M_r^-1, alike
-    reference: tuple[LayerMaterial, ...]  # materials of K_r and M_r
-    n_s: int  # degrees of freedom of the hand
-    dimension: int  # of space
+    static: Array  # triangle T of the columns in K_r^-1, (rows, L n_s + 3 L k)
+    mass: Array  # triangle T of the columns in M_r^-1, (rows, L n_s + 3 L k)
+    reference: tuple[LayerMaterial, ...]  # material of each of the L layers in K_r and M_r
+    n_s: int  # number of degrees of freedom of the hand [1]
+    dimension: int  # space dimension d
     omega: tuple[float, float]  # lowest and (a bound on the) highest frequency at the reference [1/s]
-    # triangle of the modes in K_r, and of [modes, those of the velocity] in M_r, for models whose kinematics are not
-    # exact; else None
+    # triangles of L_q in K_r and of [L_q, L_v] in M_r, for models with inexact kinematics; else None
     shape: tuple[Array, Array] | None = None
 
     @property
@@ -62,8 +61,8 @@ class ResidualNorms:
     @cached_property
     def galerkin(self) -> ResidualNorms:
         """The same for residuals with Phi' r = 0: these have no part in the rows of K_r Phi, nor of M_r Phi."""
-        static = _beyond(self.static, self.columns("static", self.reference)[2])
-        mass = _beyond(self.mass, self.columns("mass", self.reference)[1])
+        static = orthogonal_complement(self.static, self.columns("static", self.reference)[2])
+        mass = orthogonal_complement(self.mass, self.columns("mass", self.reference)[1])
         return replace(self, static=static, mass=mass)
 
     @cached_property
@@ -128,8 +127,8 @@ def _leading(T: Array, width: int) -> Array:
     return np.ascontiguousarray(columns[: int(used[-1]) + 1 if len(used) else 1])
 
 
-def _beyond(T: Array, B: Array) -> Array:
-    """Rows of T turned such that those in the range of B come first, without these; all where nothing else is left."""
+def orthogonal_complement(T: Array, B: Array) -> Array:
+    """Orthogonal complement: rows of T after removing the range of B; T itself where B has full rank."""
     Q, R, _ = scipy.linalg.qr(B, pivoting=True)
     rank = int(np.count_nonzero(abs(np.diag(R)) > DEPENDENT * abs(R[0, 0])))
     return T if rank == len(T) else np.asarray(Q[:, rank:].T @ T)

@@ -19,13 +19,14 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
-from softgrasp.reduction.certified.certificate import MeshNumber
-from softgrasp.reduction.certified.greedy import REASONS, Greedy, Round, greedy, start
-from softgrasp.reduction.certified.model import Box, CertifiedModel
+from softgrasp.reduction.certified.certificate import OfflineMeshEstimate
+from softgrasp.reduction.certified.dual import OutputDuals, output_duals
+from softgrasp.reduction.certified.greedy import REASONS, Greedy, GreedyStep, greedy, start
+from softgrasp.reduction.certified.model import CertifiedModel, ParameterDomain
 from softgrasp.reduction.certified.motion import Materials
 from softgrasp.reduction.certified.residual import ResidualSpace
 from softgrasp.reduction.certified.training import certified_model, scene_drive
-from softgrasp.reduction.certified.validation import tested
+from softgrasp.reduction.certified.validation import measured_error
 from softgrasp.reduction.parameters import box_of, materials_at, outside, run_with, thinned
 
 COLUMNS = 200  # states of a full run that its modes are taken from
@@ -35,7 +36,9 @@ RANDOM = 100  # parameters beside the grid where the finished model is looked at
 ADDED = 10  # of these become points of the training at most, each as the worst one above what the grid has reached
 PLACES = 4  # trained parameters at which the mesh is estimated
 ROUNDING = 1e-11  # of a run's length: what is left of it below is rounding
-CHUNK = 50  # parameters that are looked at together
+WATCHED = 20  # parameters by which the size of the smaller basis is found, before all are looked at
+WORTH = 0.7  # of an output's bound, above which duals are not worth the time that they take in every answer
+DUAL_PLACES = 3  # values of each constant at which duals are made to be good
 SEED = 20
 
 
@@ -102,7 +105,7 @@ class Trainer:
         self.comm = model.system.layout.comm
         lam, mu = box_of(model)
         layers = model.scene.reduction.layers == "apart" and len(model.system.materials) > 1
-        self.box = Box((lam[0], lam[1]), (mu[0], mu[1]), layers)
+        self.box = ParameterDomain((lam[0], lam[1]), (mu[0], mu[1]), layers)
         count = model.scene.reduction.grid
         axis = np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
         draws = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 1, 2)
@@ -216,8 +219,14 @@ class Trainer:
 
     def random(self, n: int, seed: int) -> list[Materials]:
         """Random materials of the box, the same on every rank."""
-        width = len(self.model.system.materials) if self.box.apart else 1
+        width = len(self.model.system.materials) if self.box.independent_layers else 1
         return self.at(np.random.default_rng(seed).uniform(size=(n, width, 2)))
+
+    def duals(self) -> OutputDuals:
+        """Duals of the outputs for the basis as it is, at which the training ends. Collective."""
+        axis = np.linspace(0.0, 1.0, DUAL_PLACES)
+        draws = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 1, 2)
+        return output_duals(self.model, self.at(draws), self.space, self.Phi)
 
     def destroy(self) -> None:
         """Free the factors. Collective."""
@@ -235,7 +244,7 @@ def train_key(model: Model) -> str:
 
 def state_of(model: CertifiedModel) -> Greedy:
     """The greedy's state in a model that was saved on the way."""
-    rounds = tuple(Round(**entry) for entry in model.training["rounds"])
+    rounds = tuple(GreedyStep(**entry) for entry in model.training["rounds"])
     return Greedy(rounds, np.array(model.training["known"], dtype=float))
 
 
@@ -293,43 +302,48 @@ def build_certified(
         last = replace(state.rounds[-1], bound=bounds[worst], worst=len(state.known))
         state = Greedy((*state.rounds[:-1], last), np.append(state.known, bounds[worst]))
     model = replace(trainer.certified, training=history(trainer, state), tolerance=tolerance)
-    many = [*trainer.parameters, *random]
-    if options.certify != "proof":
-        model = smallest(trainer, model, many, tolerance)
-    proved = trainer.bounds_at(many, model)
+    many, known = [*trainer.parameters, *random], [*state.known, *bounds]
+    if options.certify == "proof":
+        proved = trainer.bounds_at(many, model)
+    else:
+        model, proved = smallest(trainer, model, many, known, tolerance)
     about = {"proved": max(proved), "checked": len(many), "why": REASONS[state.reason]}
     drive = scene_drive(trainer.model.scene, trainer.model.system.M_hand)
     certify = "estimate" if options.certify == "estimate" and model.certify == "two" else model.certify
-    return replace(model, training={**model.training, **about}, drive=drive, certify=certify)
+    model = replace(model, training={**model.training, **about}, drive=drive, certify=certify)
+    if certify == "estimate":
+        return model
+    with_duals = replace(model, duals=trainer.duals())
+    pair = [m.run(drive=drive, allow=True).certificate.outputs.largest for m in (with_duals, model)]
+    # the same on every rank: small arrays and no part of the mesh
+    return with_duals if (pair[0] < WORTH * pair[1]).any() else model
 
 
-def smallest(trainer: Trainer, model: CertifiedModel, many: list[Materials], tolerance: float) -> CertifiedModel:
-    """The same with the least leading basis whose certificate is within the tolerance everywhere. Collective.
+def smallest(
+    trainer: Trainer, model: CertifiedModel, many: Sequence[Materials], known: Sequence[float], tolerance: float
+) -> tuple[CertifiedModel, list[float]]:
+    """The same with the least leading basis whose certificate is within the tolerance everywhere, and its bounds.
 
-    Where none is, all modes make the answer, with one basis and its own bound.
+    Bisection with the parameters of the largest ``known`` bounds; all are looked at where it ends, and those above the
+    tolerance join. Where no basis will do, all modes make the answer, with one basis and its own bound. Collective.
     """
-    low, high, best = 0, model.k2, model
-    while high - low > 1:
-        k = (low + high) // 2
-        part = replace(model, k=k, certify="two")
-        if within(trainer, part, many, tolerance):
-            high, best = k, part
-        else:
-            low = k
-    return best
+    watched = [int(i) for i in np.argsort(-np.array(known), kind="stable")[:WATCHED]]
+    low, high = 0, model.k2
+    while True:
+        while high - low > 1:
+            k = (low + high) // 2
+            bounds = trainer.bounds_at([many[i] for i in watched], replace(model, k=k, certify="two"))
+            low, high = (low, k) if max(bounds) <= tolerance else (k, high)
+        part = replace(model, k=high, certify="two") if high < model.k2 else model
+        bounds = trainer.bounds_at(many, part)
+        above = [i for i, bound in enumerate(bounds) if bound > tolerance]
+        if not above or high == model.k2:
+            return part, bounds
+        watched += [i for i in above if i not in watched]
+        low, high = high, model.k2
 
 
-def within(trainer: Trainer, model: CertifiedModel, many: list[Materials], tolerance: float) -> bool:
-    """Whether the certificate is within the tolerance everywhere; points that fail move to the front. Collective."""
-    for at in range(0, len(many), CHUNK):
-        bounds = trainer.bounds_at(many[at : at + CHUNK], model)
-        if max(bounds) > tolerance:
-            many.insert(0, many.pop(at + int(np.argmax(bounds))))
-            return False
-    return True
-
-
-def mesh_number(model: Model, places: Sequence[Materials]) -> MeshNumber:
+def offline_mesh_estimate(model: Model, places: Sequence[Materials]) -> OfflineMeshEstimate:
     """Estimate of the error of the mesh at some parameters, relative to the deformation. Collective.
 
     Raises:
@@ -345,11 +359,11 @@ def mesh_number(model: Model, places: Sequence[Materials]) -> MeshNumber:
         systems = ((m, m.system.with_materials(place)) for m in (model, other))
         pair = [krylov_model(replace(m, system=system)) for m, system in systems]
         estimates.append(accuracy.difference(pair[0], pair[1])[0])
-    return MeshNumber(tuple((place[0].lam, place[0].mu) for place in places), tuple(estimates))
+    return OfflineMeshEstimate(tuple((place[0].lam, place[0].mu) for place in places), tuple(estimates))
 
 
 def validate(trainer: Trainer, model: CertifiedModel, n: int) -> Validation:
-    """Full runs at n random parameters: how far the estimate is off, and how sure that is. Collective.
+    """Full runs at n random parameters: error of the estimate, and its confidence. Collective.
 
     With c the largest ratio seen, the share of the box where the error exceeds c times the estimate is at most
     1 - 0.05^(1/n) with a confidence of 95 %.
@@ -357,6 +371,6 @@ def validate(trainer: Trainer, model: CertifiedModel, n: int) -> Validation:
     modes, tests = trainer.Phi[:, : model.k], []
     for place in trainer.random(n, SEED + 1):
         full = run_with(trainer.models[0], place)
-        tests.append(tested(full, model.run(place, trainer.drives[0], allow=True), modes))
+        tests.append(measured_error(full, model.run(place, trainer.drives[0], allow=True), modes))
     factor, worst = max(t.truth / t.estimate if t.estimate else np.inf for t in tests), max(t.truth for t in tests)
     return Validation(n, factor, worst, float(1 - 0.05 ** (1 / n)))

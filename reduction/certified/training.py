@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +11,9 @@ import numpy as np
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import Profile
 from softgrasp.reduction.bases.basis import Basis
+from softgrasp.reduction.certified.dual import output_duals
 from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.reduction.certified.motion import FINER, Drive
+from softgrasp.reduction.certified.motion import FINER, Drive, Materials
 from softgrasp.reduction.certified.residual import ResidualSpace, kinematic_triangles
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.reduce import project_scene
@@ -43,7 +45,12 @@ def scene_drive(scene: Scene, M_hand: Array, finer: int = FINER) -> Drive:
 
 
 def certified_model(
-    model: Model, Phi: Array, k: int | None = None, space: ResidualSpace | None = None, **about: Any
+    model: Model,
+    Phi: Array,
+    k: int | None = None,
+    space: ResidualSpace | None = None,
+    places: Sequence[Materials] = (),
+    **about: Any,
 ) -> CertifiedModel:
     """A certified model of a scene from modes Phi of its displacement, leading ones first. Collective.
 
@@ -60,6 +67,7 @@ def certified_model(
         Phi: local rows (n_local, k2).
         k: modes of the answer; None takes all, with one basis.
         space: residuals of these modes; None makes them at the materials of the scene.
+        places: parameters at which duals of the outputs are to be good; none: no duals.
         about: other fields of :class:`softgrasp.reduction.certified.model.CertifiedModel`.
 
     Raises:
@@ -72,6 +80,8 @@ def certified_model(
             space.extend(Phi)
         rom = project_scene(second_order_basis(model, Phi), model)
         norms, compliance = space.norms(), space.compliance(model.output_columns)
+        if places:
+            about["duals"] = output_duals(model, places, space, Phi)
     finally:
         if own:
             space.destroy()

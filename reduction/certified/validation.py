@@ -1,4 +1,4 @@
-"""Certified answers beside the truth: full runs at the same materials and under the same motion."""
+"""Errors of certified runs against full runs at the same materials and under the same motion."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from softgrasp.reduction.replay import FullRun
 
 
 @dataclass(frozen=True)
-class Tested:
+class TestError:
     """An answer at one parameter; errors relative to the largest energy norm of the full run."""
 
-    lam: float  # lam, mu: of the first layer [Pa]
-    mu: float
-    truth: float  # against the full run
-    bound: float  # proved
-    estimate: float  # difference of the two bases; nan with one
+    lam: float  # first Lamé constant of the first layer [Pa]
+    mu: float  # shear modulus of the first layer [Pa]
+    truth: float  # error against the full run
+    bound: float  # proved bound on the error
+    estimate: float  # difference of the runs of the two bases; nan with one basis
 
     @property
     def effectivity(self) -> float:
-        """Bound over truth."""
+        """Bound over true error; nan where there is no error."""
         return self.bound / self.truth if self.truth > 0 else float("nan")
 
 
@@ -57,11 +57,11 @@ def true_error(full: FullRun, answer: ReducedTrajectory, Phi: Array, coupled: bo
     return energy_norm(system, s.Z - np.vstack([Phi @ a, Phi @ b]), v_s)
 
 
-def tested(full: FullRun, run: CertifiedRun, Phi: Array) -> Tested:
-    """A certified run, with the modes Phi of its answer, against the full run. Collective."""
+def measured_error(full: FullRun, run: CertifiedRun, Phi: Array) -> TestError:
+    """Error of a certified run, with the modes Phi of its answer, against the full run. Collective."""
     first, certificate = full.model.system.materials[0], run.certificate
     size = float(np.sqrt(2 * full.energy.max()))
     errors = [float(true_error(full, run.trajectory, Phi).max()), float(certificate.energy.largest)]
     errors.append(float("nan") if certificate.estimate is None else float(certificate.estimate.largest))
     truth, bound, estimate = (error / size for error in errors)
-    return Tested(first.lam, first.mu, truth, bound, estimate)
+    return TestError(first.lam, first.mu, truth, bound, estimate)

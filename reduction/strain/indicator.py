@@ -1,4 +1,4 @@
-"""An estimate of how far a reduced run is off, from its residual in more columns of its basis and on other cells.
+"""Estimate of the error of a reduced run, from its residual in more columns of its basis and on other cells.
 
 The run (a, v) is put into the finer equation, whose first columns are its own; with e the coordinates of its error,
 
@@ -34,7 +34,7 @@ class Finer:
 
     cells: Cells  # sampled for K columns
     K_mu: Array  # linear stiffness of every layer at mu = 1 Pa, lambda = 0, (layers, K, K)
-    K_lambda: Array  # the same at lambda = 1 Pa, mu = 0
+    K_lambda: Array  # linear stiffness of every layer at lambda = 1 Pa, mu = 0, (layers, K, K)
     G: Array  # Phi' G at the densities of the projection, (K, n_s)
     gram: Array  # Phi' Phi, (K, K)
 
@@ -80,8 +80,8 @@ def estimated_error(problem: StrainProblem, gram: Array, load: Array, weight: Ar
         E[i + 1] = state[:K]
     whole = E.copy()
     whole[:, :k] += a[edges]
-    off, size = (float(np.vdot(x, x @ gram)) for x in (E, whole))
-    return (off / size) ** 0.5 if size > 0 else 0.0
+    error, size = (float(np.vdot(x, x @ gram)) for x in (E, whole))
+    return (error / size) ** 0.5 if size > 0 else 0.0
 
 
 def _edges(steps: int, dt: float, K: Array) -> np.ndarray:

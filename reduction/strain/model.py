@@ -34,14 +34,13 @@ LOAD_STEPS, NEWTON_STEPS = 10, 30  # on the way to an equilibrium
 
 
 @dataclass(frozen=True)
-class TrainedBox:
-    """What a model was trained on."""
+class TrainingDomain:
+    """Materials, accelerations of the hand and coordinates for which a model was trained."""
 
-    # lam, mu: least and largest Lamé constant of every layer [Pa], (layers, 2)
-    lam: Array
-    mu: Array
+    lam: Array  # least and largest lambda of every layer, (layers, 2) [Pa]
+    mu: Array  # least and largest mu of every layer, (layers, 2) [Pa]
     load: Array  # least and largest a_s - g of the hand, by degree of freedom, (n_s, 2) [m/s^2, rad/s^2]
-    reach: Array  # largest |a_i| of the training runs, (k,)
+    largest_coordinates: Array  # largest |a_i| of the training runs, (k,)
 
     def refuse(self, materials: tuple[LayerMaterial, ...]) -> str:
         """Why materials lie outside; empty inside."""
@@ -66,7 +65,8 @@ class TrainedBox:
     def refuse_states(self, a: Array) -> str:
         """Why coordinates (steps + 1, k) lie outside; empty inside."""
         # what is small beside the largest coordinate cannot spoil a run
-        ratio = np.abs(a).max(axis=0) / np.maximum(self.reach, SMALL * self.reach.max(initial=1e-300))
+        largest = self.largest_coordinates
+        ratio = np.abs(a).max(axis=0) / np.maximum(largest, SMALL * largest.max(initial=1e-300))
         i = int(np.argmax(ratio))
         if ratio[i] <= REACH:
             return ""
@@ -77,7 +77,7 @@ class TrainedBox:
 class StrainRun(ReducedTrajectory):
     """A reduced run at finite strain, x = [q_s, v_s, a, a']."""
 
-    small: SmallStrainModel = field(repr=False)  # what was stepped
+    small: ReducedStrainSystem = field(repr=False)  # what was stepped
     acceleration: Array = field(repr=False)  # a_s - g [+ alpha v_s] at the midpoints, (steps, n_s) [m/s^2, rad/s^2]
     evaluations: float  # of the force, in the mean of a step
     restarts: int  # fresh tangents
@@ -129,7 +129,7 @@ def coordinates(run: ReducedTrajectory) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class SmallStrainModel:
+class ReducedStrainSystem:
     """A model at one parameter and one time step, everything made that a run needs."""
 
     model: StrainModel  # it comes from
@@ -218,29 +218,25 @@ class StrainModel:
     """Reduced model of tissue at finite strain for all lambda and mu of its training box."""
 
     cells: Cells  # sampled cells, in reduced coordinates
-    # K_mu, K_lambda: linear stiffness of every layer at 1 Pa, (layers, k, k)
-    K_mu: Array
-    K_lambda: Array
+    K_mu: Array  # linear stiffness of every layer at mu = 1 Pa, lambda = 0, (layers, k, k)
+    K_lambda: Array  # linear stiffness of every layer at lambda = 1 Pa, mu = 0, (layers, k, k)
     G: Array  # Phi' G at the densities of the projection, (k, n_s)
     materials: tuple[LayerMaterial, ...]  # of the projection, one a layer
     outputs: Outputs  # y = C_z a + C_s q_s
-    box: TrainedBox  # what it was trained on
+    box: TrainingDomain  # what it was trained on
     cells_full: int  # number of cells of the body
-    # alpha, in_space: mass-proportional damping [1/s], and whether it drags the rigid motion
-    alpha: float = 0.0
-    in_space: bool = False
+    alpha: float = 0.0  # mass-proportional damping [1/s]
+    in_space: bool = False  # alpha drags the rigid motion too
     gravity: Array | None = None  # acceleration of free fall (n_s,), or None
-    # tau, residual: of the weights, asked for and reached; 0 where no cell is left out
-    tau: float = 0.0
-    residual: float = 0.0
-    error_galerkin: float = 0.0  # in z of the model with all cells, over the training runs
-    # layout, Phi: local rows of the reconstruction (n_local, k), or None
-    layout: BlockLayout | None = None
-    Phi: Array | None = None
+    cubature_tolerance: float = 0.0  # largest |G x - b| / |b| of the cubature weights x that was asked for [1]
+    cubature_residual: float = 0.0  # |G x - b| / |b| that was reached; 0 where no cell is left out [1]
+    error_galerkin: float = 0.0  # relative error in z of the model with all cells, over the training runs [1]
+    layout: BlockLayout | None = None  # rows of the mesh that Phi has, or None
+    Phi: Array | None = None  # reconstruction z = Phi a, local rows (n_local, k), or None
     scene_hash: str = ""  # of the scene it was made for
     origin: dict[str, Any] = field(default_factory=dict)  # of `reduction.origin`, what that scene says of a run; or {}
     finer: Finer | None = None  # space in which its answers are checked; None leaves them without an estimate
-    seconds: dict[str, float] = field(default_factory=dict)  # offline, by stage
+    seconds: dict[str, float] = field(default_factory=dict)  # offline time by stage [s]
 
     @property
     def k(self) -> int:
@@ -259,7 +255,7 @@ class StrainModel:
         gravity: Array | None = None,
         *,
         outside: bool = False,
-    ) -> SmallStrainModel:
+    ) -> ReducedStrainSystem:
         """The model at new materials and a time step; online, not collective.
 
         Args:
@@ -281,7 +277,7 @@ class StrainModel:
         refuse(self.box.refuse(materials), outside)
         own = self.gravity if gravity is None else np.asarray(gravity, dtype=float)
         g = np.zeros(self.G.shape[1]) if own is None else own
-        return SmallStrainModel(self, strain_problem(self, materials, self.alpha, dt), materials, g, outside)
+        return ReducedStrainSystem(self, strain_problem(self, materials, self.alpha, dt), materials, g, outside)
 
     def displacement(self, a: Array) -> Array:
         """Deformation z = Phi a, local rows (n_local, m), of coordinates (m, k).

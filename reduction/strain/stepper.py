@@ -51,8 +51,8 @@ class StrainProblem:
 class March:
     """What a run of the stepper returns."""
 
-    a: Array  # a, v: coordinates and rates, (steps + 1, k)
-    v: Array
+    a: Array  # coordinates, (steps + 1, k)
+    v: Array  # rates of the coordinates, (steps + 1, k) [1/s]
     evaluations: float  # of the force, in the mean of a step
     restarts: int  # fresh tangents
     engine: str  # "C" or "NumPy"

@@ -43,7 +43,7 @@ from softgrasp.reduction.projection import project_outputs
 from softgrasp.reduction.replay import FullRun, check_scenes
 from softgrasp.reduction.strain.cells import Cells, Potential
 from softgrasp.reduction.strain.indicator import COLUMNS, Finer
-from softgrasp.reduction.strain.model import SmallStrainModel, StrainModel, StrainRun, TrainedBox, coordinates
+from softgrasp.reduction.strain.model import ReducedStrainSystem, StrainModel, StrainRun, TrainingDomain, coordinates
 from softgrasp.reduction.strain.nnls import nnls, on_one_rank
 
 if TYPE_CHECKING:
@@ -83,9 +83,9 @@ class Reference:
     """A full run in terms of a basis."""
 
     full: FullRun  # the run
-    flat: Products  # flat, stiff: z in the products I and K_ee
-    stiff: Products
-    mass: Products  # v in M_ee, so that its ``gram`` is I
+    flat: Products  # products of z with I
+    stiff: Products  # products of z with K_ee
+    mass: Products  # products of v with M_ee, so that its ``gram`` is I
     a: Array  # Phi' M Z, the coordinates of every snapshot, (m, k)
 
     def missed(self, a: Array, v: Array) -> Array:
@@ -168,16 +168,16 @@ class Training:
             origin=origin_of(self.model.scene_keys),
         )  # fmt: skip
 
-    def _box(self) -> TrainedBox:
+    def _box(self) -> TrainingDomain:
         materials = [run.model.system.materials for run in self.runs]
         lam, mu = (np.array([[getattr(m, key) for m in each] for each in materials]) for key in ("lam", "mu"))
         g = self.model.system.gravity
         c = [np.diff(run.trajectory.v_s, axis=0) / run.dt - (0.0 if g is None else g) for run in self.runs]
         least, most = np.min([x.min(axis=0) for x in c], axis=0), np.max([x.max(axis=0) for x in c], axis=0)
-        reach = np.max([np.abs(r.a).max(axis=0) for r in self.references], axis=0)
+        largest = np.max([np.abs(r.a).max(axis=0) for r in self.references], axis=0)
         ends = [np.stack([x.min(axis=0), x.max(axis=0)], axis=1) for x in (lam, mu)]
         load = np.stack([np.minimum(least, 0.0), np.maximum(most, 0.0)], axis=1)
-        return TrainedBox(ends[0], ends[1], load, reach)
+        return TrainingDomain(ends[0], ends[1], load, largest)
 
     def leading(self, k: int) -> StrainModel:
         """The model of k displacements on all cells."""
@@ -191,7 +191,7 @@ class Training:
             K_lambda=whole.K_lambda[:, :k, :k],
             G=whole.G[:k],
             outputs=replace(whole.outputs, C_z=whole.outputs.C_z[:, :k]),
-            box=replace(whole.box, reach=whole.box.reach[:k]),
+            box=replace(whole.box, largest_coordinates=whole.box.largest_coordinates[:k]),
             Phi=self.Phi[:, :k],
         )
 
@@ -248,8 +248,11 @@ class Training:
         with self._stage(k, "weights"):
             done = self._sampled(all_cells.cells, G[:, :k].reshape(-1, G.shape[2]), goals)
         for goal, (cells, residual) in zip(goals, done, strict=True):
-            model = replace(all_cells, cells=cells, tau=goal, residual=residual, error_galerkin=error, finer=finer)
-            models.append(replace(model, seconds={"basis": self.seconds, **self._spent[k]}))
+            seconds = {"basis": self.seconds, **self._spent[k]}
+            models.append(replace(
+                all_cells, cells=cells, cubature_tolerance=goal, cubature_residual=residual, error_galerkin=error,
+                finer=finer, seconds=seconds,
+            ))  # fmt: skip
         return models
 
     def _sampled(self, cells: Cells, G: Array, taus: Sequence[float]) -> list[tuple[Cells, float]]:
@@ -352,7 +355,7 @@ def replay_strain(rom: StrainModel, full: FullRun, model: Model | None = None, *
     return _replay(rom.at(full.dt, full.model.system.materials, outside=outside), full)
 
 
-def _replay(small: SmallStrainModel, full: FullRun) -> StrainRun:
+def _replay(small: ReducedStrainSystem, full: FullRun) -> StrainRun:
     a0 = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
     return small.run(full.hand, a0=a0)
 

@@ -1,8 +1,9 @@
-"""Tables, sentences and page of ``softgrasp control``."""
+"""What ``softgrasp control`` shows: one page, parts of which a terminal shows too, and its tables."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +15,16 @@ from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.margins import LoopMargins
 from softgrasp.lqr.plant.problem import RiccatiSolution, rigid_gains
 from softgrasp.lqr.reduced.riccati import GainQuality
-from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, gain_change, radius_of, settled
+from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, gain_change, settled
 from softgrasp.study.forward.result import trajectory_header
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation import control_equation
 from softgrasp.study.report.page import Section, captioned
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report.tables import Columns, Table, entry, table_of
+from softgrasp.study.shell.session import Page
 
 Row = tuple[Any, ...]
-EXCESS = ("excess cost as it runs", "proved to the end", "at most")
-SPECTRUM = ("abscissa [1/s]", "radius a tick")
-REDUCED_HEADER = ("basis", "N", "error of P", "error of K", *EXCESS, *SPECTRUM, "reduced ARE [ms]", "gain")
-BOX_HEADER = ("lambda [Pa]", "mu [Pa]", "error of K", *EXCESS, *SPECTRUM, "re-tuned in [ms]", "gain")
 LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal")
-BEST_HEADER = (
-    "best stable gain", "N", "error P", "error K", "excess", "at most", "abscissa", "ARE, ms", "unstable N",
-)  # fmt: skip
-MARGIN_HEADER = ("input", "gain may change by a factor", "phase margin", "at", "delay it bears")
 CAPTIONS = {
     "move.png": "The move to the target at some instants, full plant under the optimal gain.",
     "move.gif": "The move in motion{speed}.",
@@ -45,6 +39,58 @@ CAPTIONS = {
     "the crossover and its phase margin.",
     "decay.png": "Decay rates of the lowest modes without feedback and with the gains.",
 }
+
+
+def _mark(gain: GainQuality) -> str:
+    if gain.reason:
+        return "none"
+    if not gain.examined and gain.promising:
+        return "not examined"
+    if gain.stable or (gain.examined and not gain.certified):
+        return "stable" if gain.stable else "not certified"
+    if gain.abscissa_full >= 0 or gain.sampled is None:
+        return "unstable"
+    return "unstable as sampled" if gain.sampled.value >= 1 else "not certified as sampled"
+
+
+def _value(path: str, factor: float = 1.0) -> Callable[[GainQuality], float | None]:
+    """The number of a gain; nothing where there is no gain, or no finite number."""
+
+    def cell(gain: GainQuality) -> float | None:
+        value = entry(gain, path)
+        return None if gain.reason or value is None or not np.isfinite(value) else float(factor * value)
+
+    return cell
+
+
+def _number(x: float) -> str:
+    return "any" if np.isinf(x) or x > 1e3 else "none" if np.isnan(x) else f"{x:.3g}"
+
+
+GAIN: Columns = {
+    "excess cost as it runs": _value("cost_excess"), "proved to the end": _value("cost_excess_proved"),
+    "at most": _value("cost_excess_at_most"), "abscissa [1/s]": _value("abscissa_full"),
+    "radius a tick": _value("sampled.value"),
+}  # fmt: skip
+REDUCED: Columns = {
+    "basis": lambda r: TITLES[r.method], "N": "N", "error of P": _value("error_P"), "error of K": _value("error_K"),
+    **GAIN, "reduced ARE [ms]": _value("time_are", 1e3), "gain": _mark,
+}  # fmt: skip
+BOX: Columns = {
+    "lambda [Pa]": lambda p: p.materials[0].lam, "mu [Pa]": lambda p: p.materials[0].mu,
+    "error of K": _value("error_K"), **GAIN, "re-tuned in [ms]": _value("seconds", 1e3), "gain": _mark,
+}  # fmt: skip
+BEST: Columns = {
+    "best stable gain": lambda b: TITLES[b["basis"].name], "N": "best.N", "error P": "best.error_P .1e",
+    "error K": "best.error_K .1e", "excess": "best.cost_excess .1e", "at most": "best.cost_excess_at_most .1e",
+    "abscissa": "best.abscissa_full .4g", "ARE, ms": lambda b: b["best"] and f"{1e3 * b['best'].time_are:.2g}",
+    "unstable N": lambda b: ", ".join(str(r.N) for r in b["basis"].reports if r.ruled_out) or b["basis"].refused,
+}  # fmt: skip
+MARGINS: Columns = {
+    "input": "name", "gain may change by a factor": lambda a: f"{a.gain_down:.3g} to {_number(a.gain_up)}",
+    "phase margin": lambda a: f"{_number(a.phase)} deg", "at": lambda a: f"{_number(a.crossover)} rad/s",
+    "delay margin": lambda a: f"{_number(a.delay)} s",
+}  # fmt: skip
 
 
 def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[str, str]]:
@@ -162,68 +208,21 @@ def _fast(r: Retuned) -> str:
     )
 
 
-def _mark(gain: GainQuality) -> str:
-    if gain.reason:
-        return "none"
-    if not gain.examined and gain.promising:
-        return "not examined"
-    if gain.stable or (gain.examined and not gain.certified):
-        return "stable" if gain.stable else "not certified"
-    if gain.abscissa_full >= 0 or gain.sampled is None:
-        return "unstable"
-    return "unstable as sampled" if gain.sampled.value >= 1 else "not certified as sampled"
-
-
-def _cells(gain: GainQuality, *first: float, seconds: float) -> Row:
-    """``first``, excess cost, spectrum, milliseconds and mark; nothing where there is no gain, or no finite number."""
-    excess = (gain.cost_excess, gain.cost_excess_proved, gain.cost_excess_at_most)
-    values = (*first, *excess, gain.abscissa_full, radius_of(gain), 1e3 * seconds)
-    return (*(None if gain.reason or not np.isfinite(x) else float(x) for x in values), _mark(gain))
-
-
 def reduced_table(bases: Sequence[BasisGains]) -> Table:
     """One row a gain; errors of an unusable gain are shown, its cost is not."""
     reports = [(b, r) for b in bases for r in b.reports]
-    rows = [(TITLES[b.name], r.N, *_cells(r, r.error_P, r.error_K, seconds=r.time_are)) for b, r in reports]
     best = [i for i, (b, r) in enumerate(reports) if r is b.best()]
-    return Table(REDUCED_HEADER, rows, "Reduced Riccati equations", best)
-
-
-def best_table(bases: Sequence[BasisGains]) -> Table:
-    """The best stable gain of every basis, in short."""
-    rows: list[Row] = []
-    for b in bases:
-        r, unstable = b.best(), ", ".join(str(x.N) for x in b.reports if x.ruled_out)
-        cells: Row = ("",) * 7
-        if r is not None:
-            errors = (f"{x:.1e}" for x in (r.error_P, r.error_K, r.cost_excess, r.cost_excess_at_most))
-            cells = (r.N, *errors, f"{r.abscissa_full:.4g}", f"{1e3 * r.time_are:.2g}")
-        rows.append((TITLES[b.name], *cells, unstable if r is not None else unstable or b.refused))
-    return Table(BEST_HEADER, rows)
-
-
-def box_rows(r: Retuned) -> list[Row]:
-    """One row a setting."""
-    return [(p.materials[0].lam, p.materials[0].mu, *_cells(p, p.error_K, seconds=p.seconds)) for p in r.points]
+    return replace(table_of([r for _, r in reports], REDUCED, "Reduced Riccati equations"), best=best)
 
 
 def margin_section(margins: LoopMargins, figures: Sequence[tuple[Path, str]]) -> Section:
-    """One row an input: gain factors, phase margin, crossover, delay; above them what all bear at once."""
-    rows = [
-        (a.name, f"{a.gain_down:.3g} to {_number(a.gain_up)}", f"{_number(a.phase)} deg",
-         f"{_number(a.crossover)} rad/s", f"{_number(a.delay)} s")
-        for a in margins.axes
-    ]  # fmt: skip
+    """One row an input: gain factors, phase margin, crossover, delay; above them what all withstand at once."""
     low, high, phase = margins.together
     text = (
-        f"All inputs together bear any gain factors from {low:.3g} to {_number(high)}, or phase shifts up to "
+        f"All inputs together withstand any gain factors from {low:.3g} to {_number(high)}, or phase shifts up to "
         f"{phase:.3g} deg; the smallest singular value of I + L is {margins.distance:.3g}."
     )
-    return Table(MARGIN_HEADER, rows, "Margins of the small controller").section(text, figures=figures)
-
-
-def _number(x: float) -> str:
-    return "any" if np.isinf(x) or x > 1e3 else "none" if np.isnan(x) else f"{x:.3g}"
+    return table_of(margins.axes, MARGINS, "Margins of the small controller").section(text, figures=figures)
 
 
 def loop_table(study: ControlStudy) -> Table:
@@ -251,13 +250,24 @@ def csv_tables(study: ControlStudy) -> dict[str, Table]:
     if study.bases:
         files["reduced.csv"] = reduced_table(study.bases)
     if study.retuned:
-        rows = [(TITLES[r.name], r.N, *row) for r in study.retuned for row in box_rows(r)]
-        files["retune.csv"] = Table(("basis", "N", *BOX_HEADER), rows)
+        rows = [(TITLES[r.name], r.N, *row) for r in study.retuned for row in table_of(r.points, BOX).rows]
+        files["retune.csv"] = Table(("basis", "N", *BOX), rows)
     return files
 
 
-def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[Path]) -> list[Section]:
-    """Parts of the page."""
+def compose(study: GainStudy, seconds: Mapping[str, float], pictures: Sequence[Path], files: Sequence[Path]) -> Page:
+    """The page of the loops, or that of the gain alone; ``files``: controllers and fields."""
+    name, notes = study.design.model.scene.name, "\n\n".join((*study.findings, *study.notes))
+    noted = [Section("Notes", text=notes, terminal=True)] if notes else []
+    result = Section("Result", rows=result_rows(study, seconds), terminal=True)
+    if not isinstance(study, ControlStudy):
+        return Page(f"{name}: optimal gain", summary(study), [*noted, result], {}, files, " --gain-only")
+    parts = sections(study, noted, result, pictures)
+    return Page(f"{name}: optimal feedback", summary(study), parts, csv_tables(study), [*pictures, *files])
+
+
+def sections(study: ControlStudy, notes: Sequence[Section], result: Section, drawn: Sequence[Path]) -> list[Section]:
+    """Parts of the page of the loops."""
     faster = speed_up(np.array([0.0, study.loops.plan.settle]))
     speed = "" if faster == 1 else f" at {faster:g} times its speed"
     figures = {file.name: (file, text.format(speed=speed)) for file, text in captioned(drawn, CAPTIONS)}
@@ -265,11 +275,10 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
     def pick(*names: str) -> list[tuple[Path, str]]:
         return [figures[name] for name in names if name in figures]
 
-    notes = "\n\n".join((*study.findings, *study.notes))
     parts = [
         Section("", figures=pick("move.png", "move.gif")),
-        *([Section("Notes", text=notes)] if notes else []),
-        Section("Result", rows=result_rows(study, seconds), figures=pick("histories.png", "decay.png")),
+        *notes,
+        replace(result, figures=pick("histories.png", "decay.png")),
         Section("Equation", equation=control_equation(study.design.model.scene)),
     ]
     if study.bases:
@@ -279,7 +288,7 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
     for i, r in enumerate(study.retuned):
         text = f"{TITLES[r.name]}, N = {r.N}: basis of the scene's parameter, gain re-tuned at others."
         own = [] if i else pick("retune.png")
-        parts.append(Section("" if i else "Re-tuning", text, header=BOX_HEADER, rows=box_rows(r), figures=own))
+        parts.append(table_of(r.points, BOX, "" if i else "Re-tuning").section(text, figures=own))
     return parts
 
 
@@ -297,7 +306,11 @@ def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Secti
         "an allowance, not a proof."
     )
     none = [(f"{TITLES[b.name]}, N = {r.N}", r.unbounded) for b in study.bases for r in b.reports if r.unbounded]
-    parts = [reduced_table(study.bases).section(text, figures=figures)]
+    best = [{"basis": b, "best": b.best()} for b in study.bases]
+    parts = [
+        table_of(best, BEST, "Best stable gain of each basis").section(terminal=True),
+        reduced_table(study.bases).section(text, figures=figures),
+    ]
     refused = [(TITLES[b.name], b.refused) for b in study.bases if b.refused]
     parts += [Section("Refused", header=("basis", "reason"), rows=refused)] if refused else []
     parts += [Section("Without a bound of the cost", header=("gain", "reason"), rows=none)] if none else []

@@ -81,9 +81,8 @@ class FiniteLoop:
     target: Target  # where the loop goes; its shape is the equilibrium of finite strain
     reason: str = ""  # why the gain does not stabilise this plant; else empty
     cost_excess: float = float("nan")  # cost over that of the linear plant, less one [1]
-    # overshoot, overshoot_linear: farthest past the target over the way, here and on the linear plant [1]
-    overshoot: float = float("nan")
-    overshoot_linear: float = float("nan")
+    overshoot: float = float("nan")  # farthest past the target over the way [1]
+    overshoot_linear: float = float("nan")  # farthest past the target over the way on the linear plant [1]
 
     @property
     def text(self) -> str:

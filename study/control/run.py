@@ -26,8 +26,6 @@ from softgrasp.study.control import measure, report
 from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
 from softgrasp.study.pictures.background import draw_in_background
 from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.report.page import Section
-from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Flags, Page, Session, list_files
 
@@ -78,22 +76,15 @@ def run_control(
         saved = measure.save_controllers(study, out, end_state(model, study))
     seconds = {**model.watch.seconds, **watch.seconds}
     result = study.result(seconds)
-    if session.comm.rank == 0:
-        show(console, study, seconds, sentence)
 
     def page() -> Page:
-        if not isinstance(study, ControlStudy):
-            parts = [Section("Result", rows=report.result_rows(study, seconds))]
-            return Page(f"{model.scene.name}: optimal gain", report.summary(study), parts, {}, saved, " --gain-only")
         pictures: list[Path] = []
-        if session.pictures and study.retuned:
+        if session.pictures and isinstance(study, ControlStudy) and study.retuned:
             from softgrasp.study.control.plots import figure_retune  # brings Matplotlib
 
             pictures += figure_retune(study.retuned, out / "retune.png")
         pictures += drawn()
-        parts, files = report.sections(study, seconds, pictures), [*pictures, *fields, *saved]
-        title = f"{model.scene.name}: optimal feedback"
-        return Page(title, report.summary(study), parts, report.csv_tables(study), files)
+        return report.compose(study, seconds, pictures, [*fields, *saved])
 
     list_files(console, session.write(model.scene, result, page))
     if session.comm.rank == 0 and restart is not None:
@@ -211,13 +202,3 @@ def counted(bar: Progress, text: str) -> Callable[[int, int], None]:
         bar.update(task, completed=done, total=total)
 
     return note
-
-
-def show(console: Console, study: GainStudy, seconds: dict[str, float], printed: str) -> None:
-    """Notes but the one that was ``printed`` at the start, summary, and the reduced gains."""
-    if isinstance(study, ControlStudy):
-        for sentence in (*study.findings, *(note for note in study.notes if note != printed)):
-            console.print(f"note: {sentence}", soft_wrap=True, markup=False)
-    console.print(pairs(report.result_rows(study, seconds)))
-    if isinstance(study, ControlStudy) and study.bases:
-        console.print(report.best_table(study.bases).terminal(wrap=[0], width=console.width))

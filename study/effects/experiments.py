@@ -1,4 +1,4 @@
-"""Runs of a scene with any of its effects, each made once, and what two of them differ by."""
+"""Runs of a scene with any of its effects, each made once, and the change between two of them."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ Names = frozenset[str]
 
 @dataclass(frozen=True)
 class Displacements:
-    """Where a run takes its outputs, angles of the hand left out."""
+    """Displacements of the outputs over a run, angles of the hand left out."""
 
-    places: Array  # displacements, (steps + 1, outputs, d) [m]
-    rigid: Array  # their share of the hand's rigid motion [m]
+    places: Array  # displacement of each output, (steps + 1, outputs, d) [m]
+    rigid: Array  # displacement of each output by the rigid motion of the hand alone, (steps + 1, outputs, d) [m]
 
 
 def displacements(model: Model, run: Trajectory) -> Displacements:

@@ -15,7 +15,7 @@ class Change:
     """Largest change of the outputs over the run."""
 
     outputs: float  # max |y - y'| over max |y|, y the displacements of all outputs [1]
-    deformation: float  # the same of the outputs relative to the rigid motion of the hand [1]
+    deformation: float  # max |y - y'| over max |y|, y the outputs relative to the rigid motion of the hand [1]
     absolute: float  # max |y - y'| [m]
 
 
@@ -103,8 +103,8 @@ class EffectResult:
     verdict: str  # needed, optional, wasted, or not tried
     advice: str  # one sentence
     change: Change | None = None  # of the outputs of the run when it is switched alone
-    control: float | None = None  # the same when a force moves the hand, where that is a question
-    company: Company | None = None  # the same beside all other advised effects
+    control: float | None = None  # change of the outputs when a force moves the hand [1]; None: not asked
+    company: Company | None = None  # change beside all other advised effects
     cost: Cost | None = None  # of having it on
     proof: OffProof | None = None  # for an effect that is off
 

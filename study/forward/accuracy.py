@@ -46,7 +46,7 @@ class AccuracyReport:
 
     keys: Mapping[str, Any] = field(default_factory=dict)  # of result.json: ``mesh_error`` and ``time_error``
     rows: Sequence[tuple[str, str]] = ()  # of the short table
-    summary: Sequence[str] = ()  # the same in one sentence
+    summary: Sequence[str] = ()  # the rows in one sentence
     warnings: Sequence[str] = ()
 
 

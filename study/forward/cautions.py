@@ -110,7 +110,7 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
         texts.append(
             f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {steep.share:.0%} of the "
             f"body at t = {t:.3g} s, and at most {steep.typical:.2g} in {1 - SMALL_SHARE:.0%} of it: linear elasticity "
-            f"assumes small strains and rotations, and is off by about {linear_error(steep.rms, d):.2g} of the "
+            f"assumes small strains and rotations, with an error of about {linear_error(steep.rms, d):.2g} of the "
             "deformation here" + ("." if scene.effects.rotation else "; set effects.finite_strain.law = 'neo-hooke'.")
         )
     texts += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))

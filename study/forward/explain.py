@@ -84,9 +84,8 @@ class MeshReport:
     graded: bool  # whether cells shrink towards the ends
     first: bool  # whether a run may refine this mesh further
     coarser: bool  # whether the estimate is that of coarser cells, so that the error is about as large or less
-    # estimate, bound: relative error of the deformation [1]; None where the estimate takes long
-    estimate: float | None
-    bound: float | None
+    estimate: float | None  # estimated relative error of the deformation [1]; None where it takes long
+    bound: float | None  # bound on the relative error of the deformation [1]; None where it takes long
     time_error: float | None  # that of the time steps [1]
     shift: float | None  # of the ends of the zone against contact.box [m]
 
@@ -108,9 +107,8 @@ class Explanation:
     warnings: tuple[str, ...]  # one sentence each
     outputs: dict[str, str]  # name and place of each output
     memory: Need  # estimated need of mesh, factor and steps
-    # snapshot_columns, snapshot_bytes: what the run stores in memory, over all ranks
-    snapshot_columns: int
-    snapshot_bytes: int
+    snapshot_columns: int  # number of states that the run stores in memory
+    snapshot_bytes: int  # memory of these states over all ranks [byte]
     mesh: MeshReport  # singular ends, and the error they leave
     coarser: int  # unknowns of the coarser copy of a large mesh that gives modes, sag and estimate [1]; 0: none
     dimension: int  # 2 or 3

@@ -42,9 +42,8 @@ class Shot:
     path: Array  # where the grip of the hand passes, shape (steps, d) [m]
     norm: Any  # scale of the colours [unit]; from 0 to 0 when nothing deforms
     unit: tuple[float, str]  # factor and name of the unit of the colours
-    # low, high: corners of the scene in the plane of the picture, shape (2,) [m]
-    low: Array
-    high: Array
+    low: Array  # lower corner of the scene in the plane of the picture, (2,) [m]
+    high: Array  # upper corner of the scene in the plane of the picture, (2,) [m]
     hand: list[Array]  # polygons of the hand where it starts, each (corners, d); empty in 3D
     edges: Any  # outline and interfaces of layers in 2D, shape (m, 2); empty in 3D
     aim: list[Array]  # closed lines around the body at the target in the plane of the picture, each (k, 2) [m]

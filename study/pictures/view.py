@@ -13,12 +13,20 @@ import numpy as np
 from softgrasp.fem.errors import ResourceError, SceneError, no_pipe
 from softgrasp.fem.fields.vtu import Collection, check_file
 
-SHOWN = 4  # bodies in a picture, equally spaced in time, first and last included
-PEAK = 99  # percentile of the colours' end: corners are singular, and the few cells there would take all colours
+SHOWN = 4  # number of bodies in a picture, equally spaced in time, first and last included
+PEAK = 99  # percentile of the field at the end of the colour scale: corners are singular [%]
 
 
 class Move:
     """The field files of all parts of a run, instant by instant, coloured by a field.
+
+    Attributes:
+        times: time of each instant [s].
+        field: name of the field.
+        flat: whether the body lies in a plane.
+        title: name and unit of the field.
+        shown: numbers of the instants in a picture.
+        range: values of the field at both ends of the colour scale, of a vector its length.
 
     Raises SceneError: the folder has no field files, or they have no such field; ResourceError: PyVista is missing.
     """

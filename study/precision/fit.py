@@ -18,9 +18,8 @@ GAIN = 0.01  # of the error: what a slower point must gain to be on the front
 class Slope:
     """error ~ factor * x^power, fitted by least squares in logarithms."""
 
-    # question, series: of the points
-    question: str
-    series: str
+    question: str  # question of the points
+    series: str  # series of the points
     against: str  # what x is
     power: float  # exponent
     count: int  # points behind it

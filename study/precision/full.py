@@ -156,25 +156,21 @@ class Series:
 class TimedRun:
     """One run of the full model."""
 
-    # mesh, assembly, factor, per_step: seconds, medians
-    mesh: float
-    assembly: float
-    # n_e, states, dimension, steps: sizes
-    n_e: int
-    states: int
-    dimension: int
-    steps: int
+    mesh: float  # median time of the mesh [s]
+    assembly: float  # median time of the assembly [s]
+    n_e: int  # tissue unknowns
+    states: int  # dimension of the first-order model
+    dimension: int  # 2 or 3
+    steps: int  # number of time steps
     dt: float  # step [s]
-    factor: float
-    per_step: float
-    # p50, p99, max: quantiles of the seconds of a step
-    p50: float
-    p99: float
-    max: float
+    factor: float  # median time of the factorisation [s]
+    per_step: float  # median time of a step [s]
+    p50: float  # median time of a step [s]
+    p99: float  # 99 % quantile of the time of a step [s]
+    max: float  # largest time of a step [s]
     seconds: float  # of the whole run
-    # times, values: of its Series
-    times: Array
-    values: Array
+    times: Array  # times of its outputs [s]
+    values: Array  # outputs at these times [m, rad]
 
     @property
     def series(self) -> Series:

@@ -74,19 +74,17 @@ class WorkPoint:
 class RunPoint(WorkPoint):
     """A run of the full model, or of a reduced one that was made of it."""
 
-    # cells, order, steps, solver, rtol, refine: of the full model, see Setting
-    cells: tuple[int, ...] | None
-    order: int
-    steps: int
-    solver: str
-    rtol: float | None
-    refine: Refine
+    cells: tuple[int, ...] | None  # cells of the full model by direction
+    order: int  # order of its elements
+    steps: int  # number of its time steps
+    solver: str  # name of its solver
+    rtol: float | None  # relative tolerance of its solver, see Setting
+    refine: Refine  # refinement of its mesh, see Setting
     error_displacement: float  # largest error of the outputs over the largest one; ``error`` is that against the hand
     error_range: tuple[float, float]  # between what ``error`` lies, given that of the reference
-    # p50, p99, max: quantiles of the seconds of a step; inf for an unstable model
-    p50: float
-    p99: float
-    max: float
+    p50: float  # median time of a step [s]; inf for an unstable model
+    p99: float  # 99 % quantile of the time of a step [s]; inf for an unstable model
+    max: float  # largest time of a step [s]; inf for an unstable model
 
     @property
     def setting(self) -> Setting:
@@ -104,15 +102,13 @@ class ForwardPoint(RunPoint):
     """A run of the full model."""
 
     question: ClassVar[str] = "forward"
-    # n_e, states: unknowns
-    n_e: int
-    states: int
-    # dt, mesh, assembly, factor, per_step: step of the scheme, and seconds of the stages [s]
-    dt: float
-    mesh: float
-    assembly: float
-    factor: float
-    per_step: float
+    n_e: int  # tissue unknowns
+    states: int  # dimension of the first-order model
+    dt: float  # time step [s]
+    mesh: float  # time of the mesh [s]
+    assembly: float  # time of the assembly [s]
+    factor: float  # time of the factorisation [s]
+    per_step: float  # time of a step [s]
     # change of the deformation against the most steps on the same mesh; None for the most steps
     error_time: float | None = None
     error_solver: float | None = None  # against the usual solver on the same mesh and steps; None for that
@@ -136,9 +132,8 @@ class ReducedPoint(RunPoint):
     time_online: float
     spectral_abscissa: float
     stable: bool
-    # error_full, error_full_deformation: of the states against the full run behind the model
-    error_full: float
-    error_full_deformation: float
+    error_full: float  # error of the states against the full run behind the model [1]
+    error_full_deformation: float  # error of the deformation against the full run behind the model [1]
     error_outputs_full: float  # of the deformation of the outputs against that run
     scratch: float  # seconds with everything before it
     mesh: str  # mesh and order of the full run in words

@@ -41,13 +41,11 @@ WIDEST = 2e8  # entries of the snapshots beyond which the slower engines are lef
 class TimedModel(Point):
     """A reduced model with its outputs at the places."""
 
-    # p50, p99, max: quantiles of the seconds of a step; inf when it is unstable
-    p50: float
-    p99: float
-    max: float
-    # times, values: of its Series
-    times: Array
-    values: Array
+    p50: float  # median time of a step [s]; inf when it is unstable
+    p99: float  # 99 % quantile of the time of a step [s]; inf when it is unstable
+    max: float  # largest time of a step [s]; inf when it is unstable
+    times: Array  # times of its outputs [s]
+    values: Array  # outputs at these times [m, rad]
 
 
 class ReducedRuns:

@@ -25,10 +25,9 @@ class ReferenceSolution:
     """The reference solution with its error estimate, relative to the largest deformation and displacement."""
 
     series: Series  # the solution
-    # space, time, mixed: parts of the estimate, each (deformation, displacement)
-    space: tuple[float, float]
-    time: tuple[float, float]
-    mixed: tuple[float, float]
+    space: tuple[float, float]  # part of the mesh in the estimate: (deformation, displacement)
+    time: tuple[float, float]  # part of the time step in the estimate: (deformation, displacement)
+    mixed: tuple[float, float]  # part of mesh and step together in the estimate: (deformation, displacement)
     settings: tuple[Setting, ...]  # that were run
     note: str  # one sentence or more
 
@@ -143,9 +142,8 @@ class Answer:
     kind: str  # "tolerance" or "budget"
     limit: float  # the tolerance [1] or the budget [s]
     sentences: tuple[str, ...]  # the answer in words
-    # full, reduced: the best run of the full model and of a reduced one; None where none meets the limit
-    full: Choice | None = None
-    reduced: Choice | None = None
+    full: Choice | None = None  # best run of the full model; None where none meets the limit
+    reduced: Choice | None = None  # best run of a reduced model; None where none meets the limit
     closest: Choice | None = None  # when nothing does
 
     @property
@@ -201,9 +199,8 @@ class WorkStudy:
     # of the scene's own setting and of the one that answers; none without the forward question
     error_budgets: tuple[ErrorBudget, ...]
     measured_for_the_answers: tuple[WorkPoint, ...]  # points beside those of the questions
-    # measured, cached: runs made now and taken from the cache
-    measured: int
-    cached: int
+    measured: int  # number of runs made now
+    cached: int  # number of runs taken from the cache
 
     @property
     def points(self) -> dict[str, tuple[WorkPoint, ...]]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from softgrasp.reduction.certified.certificate import Certificate
-from softgrasp.reduction.certified.model import Box
+from softgrasp.reduction.certified.certificate import NORMS, Certificate
+from softgrasp.reduction.certified.model import ParameterDomain
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.page import Section, captioned, write_report
@@ -53,7 +53,7 @@ def write_page(out: Path, answers: QueryResult, line: str) -> list[Path]:
     return [*files, page]
 
 
-def box_text(box: Box) -> str:
+def box_text(box: ParameterDomain) -> str:
     """The box of the training in words."""
     return f"lambda {box.lam[0]:g} to {box.lam[1]:g} Pa, mu {box.mu[0]:g} to {box.mu[1]:g} Pa"
 
@@ -63,7 +63,7 @@ def error_table(c: Certificate) -> Table:
     mesh = c.mesh.largest if c.mesh is not None else None
     rows = [
         ("reduction", c.reduction, c.how, f"the {c.what}"),
-        ("time step", c.time_step, "estimated", "the largest energy norm"),
+        ("time step", c.time_step, "estimated", f"the {NORMS['energy']}"),
         ("mesh", mesh, "estimated" if mesh is not None else "not known", "the deformation at the outputs"),
     ]
     return Table(("error of the", "at most or about", "it is", "relative to"), rows, "Errors")

@@ -95,7 +95,7 @@ class Turns:
 
     def sentence(self, own: float, others: str) -> str:
         """The headline: speed and error in one sentence, or that there is none. ``others``: error at new materials."""
-        error = f"{own:.2%} off at the scene's parameter, {others}"
+        error = f"error {own:.2%} at the scene's parameter, {others}"
         quartiles = f"(median and quartiles of {self.rounds} rounds, processor time of both in turn)"
         again, new = f"{self.again} times as fast as the full model", f"{self.new} at a new parameter"
         if self.steady:

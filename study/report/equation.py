@@ -37,7 +37,7 @@ class Equation:
     """The equation of one scene: prose with formulas in LaTeX, each row the terms of a left and a right side."""
 
     blocks: Rows  # rows of the paper's block system in q_s, q_e, as (name, left terms, right terms)
-    stepped: Rows  # the same in z, as it is solved
+    stepped: Rows  # rows of the block system in z, as it is solved
     where: tuple[str, ...]  # definitions of the symbols that occur
     feedback: Rows = ()  # the optimal control of the plant
 

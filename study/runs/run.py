@@ -94,7 +94,9 @@ def run_sweep(
     table = sweep_table(points)
     notes = [f"{len(failed)} of {len(points)} points failed: {failed[0]}"] if failed else []
     if (worst := max(point.numbers.get("error_deformation") or 0.0 for point in points)) > COARSE:
-        notes.append(f"The reduced model is off by {worst:.0%} at an end of the sweep; take more columns, --reduced.")
+        notes.append(
+            f"The reduced model has an error of {worst:.0%} at an end of the sweep; use --reduced with more columns."
+        )
     result = {"command": "sweep", **origin(scene, comm.size), "reduced": reduced}
     result |= {"points": [point.row() for point in points], "warnings": notes}
 

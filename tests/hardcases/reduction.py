@@ -22,7 +22,7 @@ from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.bases.inner import orthonormality
 from softgrasp.reduction.bases.registry import make_bases, make_basis
 from softgrasp.reduction.bases.states import States, states_of
-from softgrasp.reduction.model import SmallModel
+from softgrasp.reduction.model import ReducedSystem
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, full_run
@@ -142,7 +142,7 @@ def edge_rows(quick: bool) -> Iterator[HardCase]:
 # --- models that grow
 
 
-def textbook_loop(rom: SmallModel, dt: float, force: Array) -> Array:
+def textbook_loop(rom: ReducedSystem, dt: float, force: Array) -> Array:
     """States of the midpoint rule on E x' = A x + B u as a textbook has it, unstable or not, (steps + 1, N)."""
     op = rom.operators
     lu = scipy.linalg.lu_factor(op.E - dt / 2 * op.A)
@@ -154,7 +154,7 @@ def textbook_loop(rom: SmallModel, dt: float, force: Array) -> Array:
     return np.array(states)
 
 
-def _energy_change(case: FullRun, rom: SmallModel, force: Array, checked: bool) -> float:
+def _energy_change(case: FullRun, rom: ReducedSystem, force: Array, checked: bool) -> float:
     """Largest change of the energy after the move, where no force acts, over the largest energy of the run."""
     x = run(rom, case.dt, force=force).x if checked else textbook_loop(rom, case.dt, force)
     energy = rom.total_energy(x)
@@ -164,7 +164,7 @@ def _energy_change(case: FullRun, rom: SmallModel, force: Array, checked: bool) 
     return float(np.abs(free - free[0]).max() / np.abs(energy[: MOVE + 1]).max())
 
 
-def _rounding_of_energy(case: FullRun, rom: SmallModel, force: Array) -> float:
+def _rounding_of_energy(case: FullRun, rom: ReducedSystem, force: Array) -> float:
     """N eps sqrt(steps), a random walk, times |x|'|H||x| / 2 over the largest energy: what its products cancel."""
     x = textbook_loop(rom, case.dt, force)[: MOVE + 1]
     terms = np.einsum("ki,ij,kj->k", abs(x), abs(rom.operators.total), abs(x)).max() / 2

@@ -17,7 +17,7 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Basis
-from softgrasp.reduction.model import ReducedModel, SmallModel
+from softgrasp.reduction.model import ReducedModel, ReducedSystem
 from softgrasp.reduction.online import ReducedTrajectory, run
 from softgrasp.reduction.projection import project
 from tests.helpers.models import Array, gather_rows, make_scene
@@ -127,7 +127,7 @@ def distance(system: BlockSystem, a: Array, b: Array) -> float:
     return float(np.sqrt(sums[0] / sums[1]))
 
 
-def small_of(model: Any, kind: tuple[Any, ...] = ("qp", "relative", True), pairs: int = 4) -> SmallModel:
+def small_of(model: Any, kind: tuple[Any, ...] = ("qp", "relative", True), pairs: int = 4) -> ReducedSystem:
     """Small model of a symplectic basis of one kind."""
     coordinates, frame, fixed = kind
     return reduced(model, symplectic_basis(model.system.layout, pairs, frame, fixed, coordinates)).at()

@@ -14,7 +14,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import states_of
-from softgrasp.reduction.model import ModelError, SmallModel
+from softgrasp.reduction.model import ModelError, ReducedSystem
 from softgrasp.reduction.online import run, run_batch
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.propagator import march, propagator, turns
@@ -25,7 +25,7 @@ FALL = {"effects": {"gravity": {"g": [1.0, -9.0]}}}
 CANONICAL = [kind for kind in KINDS if kind[0] == "qp"]
 
 
-def plain_driven(small: SmallModel, dt: float, hand: tuple[Array, Array], y: Array) -> Array:
+def plain_driven(small: ReducedSystem, dt: float, hand: tuple[Array, Array], y: Array) -> Array:
     """E_yy y' + E_ys [v_s; a_s] = A_yy y + A_ys [q_s; v_s] + f by the midpoint rule as it is written."""
     op, k, (q, v) = small.operators, 2 * small.n_s, hand
     q = np.vstack([q[:1], q[0] + dt * np.cumsum((v[1:] + v[:-1]) / 2, axis=0)])

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import scipy.linalg
@@ -14,8 +16,9 @@ from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.reduction.archive import load, save, write_checksums
 from softgrasp.reduction.bases.basis import Basis
-from softgrasp.reduction.model import ModelError, ReducedModel, SmallModel, UnstableModelError
+from softgrasp.reduction.model import ModelError, ReducedModel, ReducedSystem, UnstableModelError
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.spectrum import GROWTH_TOLERANCE
@@ -52,7 +55,7 @@ TWO_WAY = {"effects": {"reaction": True, "rotation": True}}
 GRAVITY = {"effects": {"gravity": {"g": [1.0, -9.0], "hand_weight": True}}}
 
 
-def operators(small: SmallModel) -> dict[str, Array]:
+def operators(small: ReducedSystem) -> dict[str, Array]:
     op = small.operators
     return {"E": op.E, "A": op.A, "B": op.B, "f": small.f, "energy": op.energy, "total": op.total, "S_v": op.S_v}
 
@@ -360,8 +363,34 @@ def test_three_dimensions(comm: MPI.Intracomm) -> None:
         assert distance(model.system, z, full.snapshots.Z[: len(z)]) < 1e-9  # rounding, as above
 
 
-def test_model_without_lift_cannot_return_to_the_mesh(comm: MPI.Intracomm) -> None:
+def test_model_without_reconstruction_cannot_return_to_the_mesh(comm: MPI.Intracomm) -> None:
     model = model_of(comm, TINY)
     rom: ReducedModel = replace(reduced(model, some_basis(model, "qv", "absolute", True)), reconstruction=None)
     with pytest.raises(ModelError, match="no basis on the mesh"):
         rom.reconstruct(rom.at(), np.zeros((rom.N, 1)))
+
+
+def test_files_of_earlier_versions_are_read(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    """They call the reconstruction "lift", and its checksum likewise."""
+    model, file = model_of(comm, TINY), mpi_tmp_path / "rom.h5"
+    rom = reduced(model, some_basis(model, "qp", "absolute", True))
+    save(rom, file)
+    if comm.rank == 0:
+        with h5py.File(file, "r+") as data:
+            data.move("reconstruction", "lift")
+            del data.attrs["sha256_reconstruction"]
+            write_checksums(data)
+            assert set(data.attrs) == {"format", "model", "sha256", "sha256_lift"}
+    comm.Barrier()
+    read = load(file, model.system.layout)
+    assert isinstance(read, ReducedModel)
+    assert read.reconstruction is not None
+    assert rom.reconstruction is not None
+    np.testing.assert_array_equal(read.reconstruction.L_q, rom.reconstruction.L_q)
+    comm.Barrier()
+    if comm.rank == 0:
+        with h5py.File(file, "r+") as data:
+            data["lift/L_q"][0, 0] += 1.0
+    comm.Barrier()
+    with pytest.raises(ModelError, match="damaged"):
+        load(file, model.system.layout)

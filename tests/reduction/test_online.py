@@ -18,7 +18,7 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.archive import LINEAR, load, save, write_model
 from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import states_of
-from softgrasp.reduction.model import ModelError, SmallModel
+from softgrasp.reduction.model import ModelError, ReducedSystem
 from softgrasp.reduction.online import Stepper, run, run_batch
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.propagator import propagator, rotation
@@ -38,7 +38,7 @@ from tests.helpers.reduced import (
 CANONICAL = [kind for kind in KINDS if kind[0] == "qp"]
 
 
-def plain_loop(small: SmallModel, dt: float, force: Array, x: Array) -> Array:
+def plain_loop(small: ReducedSystem, dt: float, force: Array, x: Array) -> Array:
     """The midpoint rule as it is written, in the raw coordinates."""
     op, states = small.operators, [x]
     for u in force:
@@ -169,7 +169,7 @@ def test_energy_is_constant_over_many_steps(comm: MPI.Intracomm, kind: tuple[Any
     assert_constant_energy(small, 0.005)
 
 
-def assert_constant_energy(small: SmallModel, dt: float) -> None:
+def assert_constant_energy(small: ReducedSystem, dt: float) -> None:
     """The Hamiltonian over 1e5 steps; the tissue's energy beside a resting hand where the hand is an input."""
     apart = small.fixed_solid and not small.two_way
     x0 = np.cos(np.arange(small.N))

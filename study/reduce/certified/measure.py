@@ -11,7 +11,7 @@ import numpy as np
 
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.reduction.certified.validation import Tested, tested
+from softgrasp.reduction.certified.validation import TestError, measured_error
 from softgrasp.reduction.parameters import run_at
 from softgrasp.study.reduce.certified.result import BoxCheck, Size
 from softgrasp.study.shell.timing import median_seconds
@@ -34,7 +34,7 @@ def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:
     layout = model.system.layout
     drive, comm, Phi = replace(drive, finer=None), layout.comm, reconstruction.L_q[:, 2 * layout.n_s :]
     models = [certified.with_sizes(*sizes) for sizes in sizes_of(certified)]
-    tests: list[list[Tested]] = [[] for _ in models]
+    tests: list[list[TestError]] = [[] for _ in models]
     count = TESTS if layout.n_e < LARGE else FEWER
     inner = (np.arange(count) + 0.5) / count  # of the box; the training has its edges
     lam, mu = (low * (high / low) ** inner for low, high in (box.lam, box.mu))
@@ -43,7 +43,7 @@ def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:
         with watch.stage(f"full run {i}"):
             full = run_at(model, *place)
         for part, own in zip(models, tests, strict=True):
-            own.append(tested(full, part.run(full.model.system.materials, drive, allow=True), Phi[:, : part.k]))
+            own.append(measured_error(full, part.run(full.model.system.materials, drive, allow=True), Phi[:, : part.k]))
     sizes = []
     for part, own in zip(models, tests, strict=True):
         query = median_seconds(comm, partial(part.run, allow=True), REPEATS)

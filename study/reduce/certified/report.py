@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from softgrasp.reduction.certified.certificate import NORMS
 from softgrasp.reduction.certified.greedy import REASONS
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.trainer import Validation
@@ -13,8 +14,8 @@ from softgrasp.study.reduce.certified.result import BoxCheck
 from softgrasp.study.report.tables import Table
 
 CAPTIONS = {
-    "certified_box.png": "Relative error of the deformation over the box, in the energy norm: the proved bound, the "
-    "estimate by two bases, and the truth from full runs at parameters that were not trained.",
+    "certified_box.png": "Error of the reduction over the box, relative to the largest energy norm of the deformation: "
+    "the proved bound, the estimate by two bases, and the truth from full runs at parameters that were not trained.",
     "certified_greedy.png": "The greedy: largest bound on its grid after every round, and where it ran the full model "
     "(numbers: rounds; a place may come again). With two bases it goes on to half the tolerance: the rest is for "
     "the small basis.",
@@ -64,7 +65,7 @@ def sentences(certified: CertifiedModel, check: BoxCheck | None, result: dict[st
         lines[0] += f" and is measured by one of N = {about['N2']}"
     if np.isfinite(share):
         lines[0] += (
-            f": its error is at most {share:.1e} of the deformation everywhere on the grid and at "
+            f": its error is at most {share:.1e} of the {NORMS[certified.norm]} everywhere on the grid and at "
             f"{about['checked'] - len(certified.training['points'])} random parameters, "
             f"{'estimated' if certified.certify == 'estimate' else 'proved'}."
         )

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from softgrasp.reduction.certified.validation import Tested
+from softgrasp.reduction.certified.validation import TestError
 
 
 @dataclass(frozen=True)
 class Size:
     """A certified model of k modes at all tests."""
 
-    k: int  # k, k2: modes of the answer, and of the basis that certifies it
-    k2: int
+    k: int  # modes of the answer
+    k2: int  # modes of the basis that certifies it
     N: int  # dimension of the answer
     query: float  # median seconds of an answer with its certificate
-    tested: tuple[Tested, ...]  # one a parameter
+    tested: tuple[TestError, ...]  # one a parameter
 
     def largest(self, key: str) -> float:
         """Over the tests."""

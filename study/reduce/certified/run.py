@@ -23,7 +23,7 @@ from softgrasp.reduction.certified.trainer import (
     SHARE,
     Trainer,
     build_certified,
-    mesh_number,
+    offline_mesh_estimate,
     state_of,
     train_key,
     validate,
@@ -96,7 +96,7 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
 def _with_mesh(certified: CertifiedModel, model: Model, places: list[Materials]) -> tuple[CertifiedModel, str]:
     """The model with the estimate of its mesh, or without one and the reason. Collective."""
     try:
-        return replace(certified, mesh=mesh_number(model, places)), ""
+        return replace(certified, mesh=offline_mesh_estimate(model, places)), ""
     except SoftgraspError as error:
         return certified, f"The error of the mesh could not be estimated: {error}"
 

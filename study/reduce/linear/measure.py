@@ -26,7 +26,7 @@ from softgrasp.study.reduce.linear.result import (
     LARGER,
     BoxErrors,
     BoxPoint,
-    BoxTests,
+    DomainTests,
     MethodSweep,
     Point,
     TestedModel,
@@ -188,12 +188,14 @@ def errors_at(full: FullRun, models: Sequence[TestedModel]) -> tuple[float, ...]
     return tuple(errors)
 
 
-def measure_box(full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress = lambda done, of: None) -> BoxTests:
+def measure_box(
+    full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress = lambda done, of: None
+) -> DomainTests:
     """Train, and test over the box. Collective. Raises SolverError: a run failed. ResourceError: no memory."""
     scene = full.model
     reason = outside(scene) or ("" if by_error(sweeps) else "no method has a stable model")
     if reason:
-        return BoxTests(none=reason)
+        return DomainTests(none=reason)
     first, training, grid = scene.system.materials[0], training_of(scene), grid_of(scene)
     models = box_models(full, sweeps, training_states(full, training) if training else None)
     trained_at = ((first.lam, first.mu), *training)
@@ -208,7 +210,7 @@ def measure_box(full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress
         runs = len(trained_at) if m.several else int(m.method.snapshots)
         largest = max(errors, key=lambda e: (not np.isfinite(e), e))
         summary.append(BoxErrors(m.method.key, m.model.N, runs, own[i], statistics.median(errors), largest))
-    return BoxTests(tuple(models), tuple(points), tuple(summary), trained_at if training else (), box_of(scene))
+    return DomainTests(tuple(models), tuple(points), tuple(summary), trained_at if training else (), box_of(scene))
 
 
 def headline_turns(full: FullRun, sweeps: Sequence[MethodSweep]) -> Turns | None:

@@ -10,7 +10,7 @@ from softgrasp.reduction.bases.registry import Method
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
     N_NOTE,
-    BoxTests,
+    DomainTests,
     MethodSweep,
     Point,
     ReductionStudy,
@@ -130,7 +130,7 @@ def time_table(study: ReductionStudy, narrow: bool = False) -> Table:
     return Table(("method", "N", *TIMES), rows, "Times")
 
 
-def box_table(box: BoxTests, narrow: bool = False) -> Table:
+def box_table(box: DomainTests, narrow: bool = False) -> Table:
     """Errors at other parameters, trained by one run or by several."""
     titles = {m.method.key: title_of(m.method, narrow) for m in box.models}
     rows = [
@@ -139,7 +139,7 @@ def box_table(box: BoxTests, narrow: bool = False) -> Table:
     return Table(("method", "N", "runs", "own", "median", "largest"), rows, "Other parameters")
 
 
-def box_note(box: BoxTests) -> str:
+def box_note(box: DomainTests) -> str:
     """What the table of other parameters shows."""
     tests, (lam, mu) = sum(not p.trained for p in box.points), box.ranges
     text = (
@@ -192,7 +192,7 @@ def sections(study: ReductionStudy, files: Sequence[Path]) -> list[Section]:
     return [*parts, *box_sections(study.box)]
 
 
-def box_sections(box: BoxTests) -> list[Section]:
+def box_sections(box: DomainTests) -> list[Section]:
     """Errors at other parameters: a summary, and one table for each N with a column for each basis."""
     if box.none:
         return [Section("Other parameters", f"No tests at other parameters: {box.none}.")]

@@ -33,12 +33,11 @@ class Point:
     # |X - X_r|_F / |X|_F of X = [z, v_z], after removing the rigid motion of the hand: the measure that tables,
     # pictures and the best method go by
     error_deformation: float
-    error: float  # the same of X = [q_s, v_s, q_e, v_e], for every basis the paper's error [SBRH21]
-    error_canonical: float  # the same of X = [q_s, p_s, q_e, p_e]
+    error: float  # |X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e]: the paper's error [SBRH21]
+    error_canonical: float  # |X - X_r|_F / |X|_F of X = [q_s, p_s, q_e, p_e]
     error_energy: float  # largest error of the tissue's energy over its largest value
-    # projection_error_deformation, projection_error: what the basis alone leaves of the first two
-    projection_error_deformation: float
-    projection_error: float
+    projection_error_deformation: float  # least ``error_deformation`` of any state in the basis
+    projection_error: float  # least ``error`` of any state in the basis
     time_offline: float  # basis and projection; one factorisation of the snapshots serves all N
     time_setup: float  # what a new parameter costs before its run: small matrices, test of stability, propagator
     time_online: float  # a whole run
@@ -74,8 +73,8 @@ class TestedModel:
 class BoxPoint:
     """One parameter with the deformation error of every model there."""
 
-    lam: float  # lam, mu: of the first layer [Pa]
-    mu: float
+    lam: float  # first Lamé constant of the first layer [Pa]
+    mu: float  # shear modulus of the first layer [Pa]
     trained: bool  # a run at this parameter trained some of the bases, so that it is no test
     errors: tuple[float, ...]  # one for each model
 
@@ -87,13 +86,13 @@ class BoxErrors:
     method: str  # key
     N: int  # its dimension
     runs: int  # full runs that trained it
-    own: float  # own, median, largest: errors
-    median: float
-    largest: float
+    own: float  # error at the scene's own parameter
+    median: float  # median error over parameters that trained no basis
+    largest: float  # largest error over parameters that trained no basis
 
 
 @dataclass(frozen=True)
-class BoxTests:
+class DomainTests:
     """All tests at other parameters."""
 
     models: tuple[TestedModel, ...] = ()  # tested
@@ -122,7 +121,7 @@ class ReductionStudy:
     full: FullRun  # the full run
     sweeps: tuple[MethodSweep, ...]  # every method
     times: FullTimes  # of the full model
-    box: BoxTests  # errors at other parameters
+    box: DomainTests  # errors at other parameters
     turns: Turns | None  # full model and the most accurate stable reduced one in turn; None without any
     findings: tuple[str, ...]  # what the numbers show, in sentences
     speed_notes: tuple[str, ...]  # what the times are measured against

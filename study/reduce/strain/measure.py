@@ -193,7 +193,7 @@ def _measure(
         comm, lambda: replace(done[0]).error_estimate, SETUPS
     )  # a copy has not made its own
     return StrainPoint(
-        N=rom.N, k=rom.k, tau=rom.tau, residual=rom.residual, cells=rom.cells.count,
+        N=rom.N, k=rom.k, tau=rom.cubature_tolerance, residual=rom.cubature_residual, cells=rom.cells.count,
         error_own=own.z, error_own_velocity=own.v, error_own_energy_norm=own.energy_norm,
         estimate_own=done[0].error_estimate, error_training=trained.z, error_galerkin=rom.error_galerkin,
         floor=training.references[0].projection_error(rom.k),

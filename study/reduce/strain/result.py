@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from softgrasp.reduction.replay import FullRun
-from softgrasp.reduction.strain.model import StrainModel, TrainedBox
+from softgrasp.reduction.strain.model import StrainModel, TrainingDomain
 from softgrasp.study.reduce.times import FullTimes, Turns
 
 CELLS_AT = (14, 24)  # N at which tau is varied
@@ -16,29 +16,27 @@ CELLS_AT = (14, 24)  # N at which tau is varied
 class StrainPoint:
     """One model at finite strain; errors are relative and in z unless they say otherwise, times in seconds."""
 
-    N: int  # N, k: dimension with the hand's 2 n_s, and displacements
-    k: int
-    tau: float  # tau, residual: of the weights, asked for and reached
-    residual: float
+    N: int  # dimension with the hand's 2 n_s
+    k: int  # displacements
+    tau: float  # largest |G x - b| / |b| of the cubature weights x that was asked for
+    residual: float  # |G x - b| / |b| that was reached
     cells: int  # that carry a weight
-    # error_own, error_own_velocity, error_own_energy_norm: on the scene's own run, which trained the model: of z, of v
-    # in M_ee, of (z, v) in (z'K_ee z + v'M_ee v)^(1/2)
-    error_own: float
-    error_own_velocity: float
-    error_own_energy_norm: float
+    error_own: float  # of z on the scene's own run
+    error_own_velocity: float  # of v in M_ee on the scene's own run
+    error_own_energy_norm: float  # of (z, v) in (z'K_ee z + v'M_ee v)^(1/2) on the scene's own run
     estimate_own: float  # what the model itself estimates of ``error_own``
     error_training: float  # over all training runs
-    error_galerkin: float  # the same of the model on all cells
+    error_galerkin: float  # over all training runs, of the model on all cells
     floor: float  # of the basis, on the scene's own run
-    error_materials: float | None  # error_materials, error_motions: largest on held-out runs; None without any
-    error_motions: float | None
+    error_materials: float | None  # largest on held-out runs of new materials; None without any
+    error_motions: float | None  # largest on held-out runs of new motions; None without any
     # largest change of the model's own energy that neither load nor damping explains, over all training runs
     drift: float
     evaluations: float  # of the force in a step
     engine: str  # of the stepper, "C" or "NumPy"
     time_offline: float  # basis, model on all cells, forces and weights, after the full runs
-    time_setup: float  # time_setup, time_online: a new parameter before its run, and a run
-    time_online: float
+    time_setup: float  # of a new parameter before its run
+    time_online: float  # of a run
     time_estimate: float  # of the error of a run, after it
 
 
@@ -47,8 +45,8 @@ class HeldOutTest:
     """A full run that trained no model of its family."""
 
     kind: str  # "material" or "motion", whichever is new
-    lam: float  # lam, mu: of the first layer [Pa]
-    mu: float
+    lam: float  # first Lamé constant of the first layer [Pa]
+    mu: float  # shear modulus of the first layer [Pa]
     target: tuple[float, ...]  # where the hand ends [m]
     errors: dict[int, float | None]  # in z by N; None where the model refuses the run or fails
     estimates: dict[int, float | None]  # of them by N, made by the model without the full run
@@ -59,7 +57,7 @@ class StrainFamily:
     """Models of all N from the same training runs."""
 
     key: str  # "own", the scene's run alone, or "box", runs at other materials and motions too
-    box: TrainedBox  # what they answer for
+    box: TrainingDomain  # what they answer for
     runs: int  # full runs that trained them
     points: tuple[StrainPoint, ...]  # with tau from the model on all cells, one for each N
     curves: tuple[StrainPoint, ...]  # those, and others of some N with given tau

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from softgrasp.fem.petsc import on_root, total
 from softgrasp.reduction.bases.engines import ENGINES, EngineName, factor, magnitude, small_svd
 from softgrasp.reduction.bases.states import BasisError, Columns
-from softgrasp.reduction.bases.svd_like import balanced, form, svd_like_pairs
+from softgrasp.reduction.bases.svd_like import balanced, svd_like_pairs, symplectic_form
 from softgrasp.reduction.bases.truncation import Part, Truncation, counts_of, needed
 from tests.helpers.models import Array, close, same_everywhere
 
@@ -163,13 +163,13 @@ def test_magnitude_is_the_power_of_two_above_all_ranks(comm: MPI.Intracomm) -> N
 def symplectic_error(S: Array) -> float:
     k = S.shape[1] // 2
     J = np.eye(2 * k, k=k) - np.eye(2 * k, k=-k)
-    return float(np.abs(form(S, S) - J).max())
+    return float(np.abs(symplectic_form(S, S) - J).max())
 
 
 def gone(S: Array, X: Array) -> float:
     """Norm of X - S S^+ X."""
     k = S.shape[1] // 2
-    return float(np.linalg.norm(X - S[:, k:] @ form(S[:, :k], X) + S[:, :k] @ form(S[:, k:], X)))
+    return float(np.linalg.norm(X - S[:, k:] @ symplectic_form(S[:, :k], X) + S[:, :k] @ symplectic_form(S[:, k:], X)))
 
 
 def canonical_matrix(r: int, sigma: Array, isotropic: int, seed: int = 2) -> Array:
@@ -257,7 +257,9 @@ def test_balanced_pairs_keep_product_and_span() -> None:
     S, T = np.random.default_rng(5).standard_normal((2, 12, 7)) * [[[1.0]], [[30.0]]]
     S_b, T_b = balanced(S, T)
     assert np.linalg.norm(S_b, axis=0) == pytest.approx(np.linalg.norm(T_b, axis=0), rel=1e-12)  # rounding
-    assert np.diag(form(S_b, T_b)) == pytest.approx(np.diag(form(S, T)), rel=1e-12, abs=1e-12)  # rounding
+    assert np.diag(symplectic_form(S_b, T_b)) == pytest.approx(
+        np.diag(symplectic_form(S, T)), rel=1e-12, abs=1e-12
+    )  # rounding
     for j in range(7):
         assert (
             scipy.linalg.subspace_angles(np.c_[S[:, j], T[:, j]], np.c_[S_b[:, j], T_b[:, j]]).max() < 1e-6

@@ -23,7 +23,7 @@ from softgrasp.reduction.bases.states import states_of
 from softgrasp.reduction.certified import bounds
 from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.reduction.certified.certificate import Bound, ToleranceError
-from softgrasp.reduction.certified.model import Box
+from softgrasp.reduction.certified.model import ParameterDomain
 from softgrasp.reduction.certified.motion import Drive
 from softgrasp.reduction.certified.oscillators import march
 from softgrasp.reduction.certified.residual import ResidualSpace
@@ -349,7 +349,9 @@ def test_a_batch_is_the_runs_one_by_one(comm: MPI.Intracomm) -> None:
 
 
 def test_refusals(comm: MPI.Intracomm) -> None:
-    certified = ritz(build(make_scene(), comm=comm), 4, 9, box=Box((30.0, 60.0), (20.0, 60.0)), tolerance=1e-3)
+    certified = ritz(
+        build(make_scene(), comm=comm), 4, 9, box=ParameterDomain((30.0, 60.0), (20.0, 60.0)), tolerance=1e-3
+    )
     with pytest.raises(ToleranceError, match=r"proved to be at most .* above the tolerance 0\.001"):
         certified.run()
     with pytest.raises(ToleranceError, match="larger than the deformation itself"):
@@ -379,7 +381,7 @@ def test_refusals(comm: MPI.Intracomm) -> None:
 @pytest.mark.ranks
 def test_archive(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     model = build(make_scene(KELVIN_VOIGT), comm=comm)
-    certified = ritz(model, 4, 9, box=Box((30.0, 500.0), (20.0, 500.0)), tolerance=0.5)
+    certified = ritz(model, 4, 9, box=ParameterDomain((30.0, 500.0), (20.0, 500.0)), tolerance=0.5)
     file = mpi_tmp_path / "certified.h5"
     save_certified(certified, file)
     materials = certified.materials(77.0, 60.0)
@@ -413,7 +415,7 @@ def test_archive(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
 
 
 @pytest.mark.ranks
-@pytest.mark.parametrize("whole", [False, True], ids=["online", "lift"])
+@pytest.mark.parametrize("whole", [False, True], ids=["online", "reconstruction"])
 @pytest.mark.parametrize(
     ("part", "changed", "word"),
     [("box", {"lam": [30, 500], "mu": [20, 500]}, "'apart' is missing"), ("reference", [{"nu": 0.3}], "nu")],

@@ -19,8 +19,8 @@ from softgrasp.reduction.certified.trainer import (
     ADDED,
     Trainer,
     build_certified,
-    mesh_number,
     motions_of,
+    offline_mesh_estimate,
     state_of,
     train_key,
     validate,
@@ -187,7 +187,7 @@ def test_layers_apart(comm: MPI.Intracomm) -> None:
     mixed = (replace(first, lam=400.0, mu=30.0), replace(second, lam=second.lam, mu=2 * second.mu))
     run = certified.run(mixed, allow=True)
     assert run.certificate.inside
-    assert not replace(certified, box=replace(certified.box, apart=False)).inside(mixed)
+    assert not replace(certified, box=replace(certified.box, independent_layers=False)).inside(mixed)
     system, full = full_at(model, mixed)
     error, size = error_to(system, full, certified, run)
     assert (run.certificate.energy.values >= error - 1e-9 * size).all()
@@ -197,7 +197,7 @@ def test_layers_apart(comm: MPI.Intracomm) -> None:
 @pytest.mark.serial
 def test_the_mesh_has_a_number(comm: MPI.Intracomm) -> None:
     model = build(make_scene(KELVIN_VOIGT, SMALL), comm=comm)
-    number = mesh_number(model, [materials_at(model, 50.0, 50.0), materials_at(model, 500.0, 50.0)])
+    number = offline_mesh_estimate(model, [materials_at(model, 50.0, 50.0), materials_at(model, 500.0, 50.0)])
     assert len(number.estimates) == 2
     assert 0.01 < number.largest < 1
 

@@ -22,7 +22,7 @@ from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.model import ModelError, Outputs
 from softgrasp.reduction.strain import stepper
 from softgrasp.reduction.strain.cells import Cells, Potential
-from softgrasp.reduction.strain.model import StrainModel, TrainedBox
+from softgrasp.reduction.strain.model import StrainModel, TrainingDomain
 from softgrasp.reduction.strain.nnls import nnls
 from softgrasp.reduction.strain.stepper import March, StrainProblem, march_strain
 
@@ -248,16 +248,16 @@ def test_without_a_compiler_numpy_steps_and_says_so(monkeypatch: pytest.MonkeyPa
 def model_of() -> StrainModel:
     cells = cells_of("neo-hooke", 2)
     ones = np.ones(2)
-    box = TrainedBox(
+    box = TrainingDomain(
         lam=np.outer([50.0, 80.0], [0.8, 1.2]),
         mu=np.outer([50.0, 20.0], [0.8, 1.2]),
         load=np.outer(ones, [-2.0, 2.0]),
-        reach=np.full(4, 0.5),
+        largest_coordinates=np.full(4, 0.5),
     )
     K = np.stack([np.eye(4), np.eye(4)])
     return StrainModel(
         cells, K, K, np.random.default_rng(5).standard_normal((4, 2)), LAYERS,
-        Outputs(np.ones((1, 4)), np.ones((1, 2)), ("tip",)), box, 99, tau=1e-2, scene_hash="abc",
+        Outputs(np.ones((1, 4)), np.ones((1, 2)), ("tip",)), box, 99, cubature_tolerance=1e-2, scene_hash="abc",
     )  # fmt: skip
 
 
@@ -285,7 +285,7 @@ def test_a_model_answers_inside_its_box_only() -> None:
             model.at(dt)
     with pytest.raises(ModelError, match="not finite"):
         small.run((hand_of(1.0)[0], np.full_like(hand_of(1.0)[1], np.nan)))
-    narrow = replace(model, box=replace(model.box, reach=model.box.reach * 1e-4))
+    narrow = replace(model, box=replace(model.box, largest_coordinates=model.box.largest_coordinates * 1e-4))
     with pytest.raises(ModelError, match="times what the training runs reached"):
         narrow.at(0.01).run(hand_of(1.0))
 
@@ -307,7 +307,7 @@ def test_a_file_gives_the_same_model(tmp_path: Path) -> None:
         warnings.simplefilter("ignore", RuntimeWarning)  # where there is no compiler
         one, two = (m.at(0.01).run(hand_of(1.0)) for m in (model, read))
     np.testing.assert_array_equal(one.a, two.a)
-    assert (read.N, read.tau, read.outputs.names, read.cells.law) == (12, 1e-2, ("tip",), "neo-hooke")
+    assert (read.N, read.cubature_tolerance, read.outputs.names, read.cells.law) == (12, 1e-2, ("tip",), "neo-hooke")
     with pytest.raises(ModelError, match="another scene"):
         load(tmp_path / "strain.h5", scene_hash="other")
     for key, value in (("cells_full", None), ("beta", 0.1)):  # as other versions would write it

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 import io
 import json
 import re
@@ -79,6 +80,32 @@ def test_result_holds_what_design_names(result: dict[str, Any], out: Path) -> No
     for points in result["reduced"].values():
         assert [p["N"] for p in points] == [4, 8, 12]
         assert all(p.keys() >= POINT for p in points)
+
+
+def test_page_and_terminal_have_the_same_tables(result: dict[str, Any], out: Path) -> None:
+    text, page = MPI.COMM_WORLD.bcast(ran(out, "newton-adi")[1]), (out / "report.html").read_text()
+    best = [
+        min((p for p in points if p["stable"]), key=lambda p: p["cost_excess"]) for points in result["reduced"].values()
+    ]
+    for heading in ("best stable gain", "true relative residual", "unstable N"):
+        assert heading in text
+        assert heading in page
+    for point in best:
+        for key in ("error_K", "cost_excess_at_most"):
+            assert f"{point[key]:.1e}" in text
+            assert f"{point[key]:.1e}" in page
+
+
+@pytest.mark.serial
+def test_the_gain_alone_has_its_notes_on_page_and_terminal(tmp_path: Path) -> None:
+    scene, text = tmp_path / "plain.toml", io.StringIO()
+    lines = re.sub(r"(?ms)^\[control\].*?(?=^\[|\Z)", "", (SCENES / "paper_lqr.toml").read_text())
+    scene.write_text(lines)
+    console = Console(file=text, width=400)
+    found = run_control(scene, tmp_path / "out", ["tissue.cells=[2,4]"], console, quiet=True, gain_only=True)
+    assert "no [control] table" in found["notes"][0]
+    assert found["notes"][0] in text.getvalue()
+    assert found["notes"][0] in html.unescape((tmp_path / "out" / "report.html").read_text())
 
 
 @pytest.mark.ranks(2)

@@ -6,9 +6,10 @@ from typing import Any
 
 from mpi4py import MPI
 
+from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.study.effects.measure import counting, difference
+from softgrasp.study.effects.measure import counting, difference, objects_of
 from tests.helpers.effects import GRAVITY, NEUTRAL, RAYLEIGH, VISCOUS, WEIGHT
 from tests.helpers.models import LAYERS, make_scene
 
@@ -30,6 +31,14 @@ def test_petsc_counts_the_same_objects_for_effects_that_are_off(comm: MPI.Intrac
     assert difference(objects_of_a_run(comm, effects=VISCOUS), bare) == {"Vector": 1}  # K z of the last step
     two = objects_of_a_run(comm, tissue={"layers": {"core": LAYERS["core"]}})
     assert two["Matrix"] > bare["Matrix"]  # the count can tell
+
+
+def test_gravity_allocates_what_explain_says(comm: MPI.Intracomm) -> None:
+    """Nothing, also where it is tried from equilibrium: that start has a solver of its own."""
+    weighing = make_scene(effects=GRAVITY, time={"start": "equilibrium"})
+    assert EFFECTS["gravity"].operators(weighing) == ()
+    assert difference(objects_of_a_run(comm, effects=GRAVITY, time={"start": "equilibrium"}), objects_of_a_run(comm))
+    assert objects_of(comm, weighing) == objects_of(comm, make_scene())
 
 
 def test_petsc_counts_no_object_made_in_a_step(comm: MPI.Intracomm) -> None:

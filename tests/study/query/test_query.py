@@ -23,7 +23,7 @@ from softgrasp.fem.scene.file import load_scene, resolved_toml
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.reduction.archive import write_checksums
 from softgrasp.reduction.certified.archive import load_certified, save_certified
-from softgrasp.reduction.certified.model import Box, CertifiedModel
+from softgrasp.reduction.certified.model import CertifiedModel, ParameterDomain
 from softgrasp.reduction.certified.training import certified_model
 from softgrasp.study.cli import app
 from softgrasp.study.query.request import drive_of, materials_of, parse_settings, read_batch
@@ -38,7 +38,7 @@ SCENES = Path(__file__).parents[3] / "demos" / "scenes"
 def made(*overrides: str) -> tuple[Model, CertifiedModel]:
     model = build(load_scene(SCENES / "paper_forward.toml", [*KV, *overrides]), comm=MPI.COMM_WORLD)
     Phi = lowest_modes(model.system, 40)[1]
-    return model, certified_model(model, Phi, k=20, tolerance=0.5, box=Box((30.0, 500.0), (20.0, 500.0)))
+    return model, certified_model(model, Phi, k=20, tolerance=0.5, box=ParameterDomain((30.0, 500.0), (20.0, 500.0)))
 
 
 @pytest.fixture(scope="module")

@@ -26,10 +26,11 @@ from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.reduction.certified.archive import load_certified, save_certified
-from softgrasp.reduction.certified.model import Box, CertifiedModel
+from softgrasp.reduction.certified.model import CertifiedModel, ParameterDomain
 from softgrasp.reduction.certified.motion import Materials
 from softgrasp.reduction.certified.training import certified_model
 from softgrasp.reduction.certified.validation import true_error
+from softgrasp.reduction.parameters import materials_at
 from softgrasp.reduction.replay import FullRun
 from softgrasp.study.query.request import drive_of
 from softgrasp.study.query.run import run_query
@@ -43,7 +44,12 @@ SCENES = {
         "effects.damping={kind='rayleigh', beta=0.004, alpha=0.4, drag='space'}",
     ],
     "pushed": [*SMALL, "motion.drive='force'", "time.end=4.0"],
+    "pushed by a table": [*SMALL, "motion={profile='csv', csv='own.csv', drive='force'}", "time.end=3.0"],
+    "led by a table": [*SMALL, "motion={profile='csv', csv='own.csv'}", "time.end=3.0"],
 }  # fmt: skip
+TABLE = np.array([[0, 0, 0], [0.4, 1, 2], [0.5, 3, -1], [1.1, 0, 1], [1.7, 5, 2], [2.3, 4, 4], [3, 5, 3]], dtype=float)
+# modes of the answer, of the proof, of 78, and whether there are duals of the outputs
+MODES = (60, 77, False), (16, 40, True)
 ROUNDING = 1e-9  # of the largest output, or energy norm: full runs solve to rounding
 KINDS = ("plain", "dt", "motion", "motion and dt", "batch", "batch and dt")
 
@@ -51,9 +57,13 @@ KINDS = ("plain", "dt", "motion", "motion and dt", "batch", "batch and dt")
 @cache
 def made(name: str, folder: Path) -> tuple[Model, CertifiedModel, Path]:
     """Scene, certified model as a query reads it from its file, and the file."""
-    model = build(load_scene(shipped_scenes()["paper_forward"], SCENES[name]), comm=MPI.COMM_SELF)
-    box = Box((30.0, 500.0), (20.0, 500.0))
-    save_certified(certified_model(model, lowest_modes(model.system, 30)[1], k=10, box=box), folder / f"{name}.h5")
+    np.savetxt(folder / "own.csv", TABLE, delimiter=",")
+    (folder / "scene.toml").write_text(shipped_scenes()["paper_forward"].read_text().replace("target", "# target"))
+    overrides = ["motion.target=[5, 3]"] * ("table" not in name)
+    model = build(load_scene(folder / "scene.toml", [*overrides, *SCENES[name]]), comm=MPI.COMM_SELF)
+    box, (k, k2, duals) = ParameterDomain((30.0, 500.0), (20.0, 500.0)), MODES[name in ("kelvin-voigt", "falling")]
+    Phi, places = lowest_modes(model.system, k2)[1], [materials_at(model, x, y) for x in box.lam for y in box.mu]
+    save_certified(certified_model(model, Phi, k=k, box=box, places=places * duals), folder / f"{name}.h5")
     return model, load_certified(folder / f"{name}.h5", model.system.layout), folder / f"{name}.h5"
 
 

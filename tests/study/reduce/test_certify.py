@@ -85,7 +85,7 @@ def test_off_makes_no_residual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert {"certified", "tests"}.isdisjoint(json.loads((tmp_path / "result.json").read_text()))
     (path,) = (tmp_path / "models").glob("*.h5")
     with h5py.File(path) as file:
-        assert set(file) <= {"parts", "outputs", "gravity", "lift"}
+        assert set(file) <= {"parts", "outputs", "gravity", "reconstruction"}
     model = load(path)
     # triangles of residuals would have 2 + 3 k = 17 rows
     assert max(n for part in model.parts.values() for n in part.shape[-2:]) <= model.N == 14

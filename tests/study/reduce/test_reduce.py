@@ -449,7 +449,7 @@ def test_a_headline_needs_quartiles_that_agree_and_names_the_error_at_new_materi
     close, apart = Spread(24.0, 25.0, 26.0), Spread(20.0, 40.0, 60.0)
     said = Turns(close, close, 9).sentence(7e-3, "33.00% in the median and 84.00% at most at new materials")
     assert said.startswith("It runs 25 (24 to 26) times as fast")
-    assert "0.70% off" in said
+    assert "error 0.70% at the scene's parameter" in said
     assert "84.00% at most at new materials" in said
     for turns in (Turns(apart, close, 9), Turns(close, apart, 9)):
         assert "too much to name a speed-up" in turns.sentence(7e-3, "")
