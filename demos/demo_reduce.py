@@ -39,7 +39,7 @@ stiff = model.with_materials(lam=100.0)
 here = sg.errors(rom, sg.replay(rom, model, run), model, run).error_deformation
 there = sg.errors(rom, sg.replay(rom, stiff, run), stiff, sg.simulate(stiff)).error_deformation
 if speak:
-    print(f"N = 30: deformation off by {here:.1e} where it was trained, {there:.1e} at twice the lambda")
+    print(f"N = 30: error of the deformation {here:.1e} where it was trained, {there:.1e} at twice the lambda")
 assert here < 2e-3  # a thousandth of the deformation
 assert here < there < 0.15  # the shapes of lambda = mu do not span those of lambda = 2 mu
 

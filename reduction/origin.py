@@ -21,7 +21,7 @@ Origin = Mapping[str, Any]
 # of no effect on a run beyond the tolerance of its solver
 FREE = re.compile(
     r"(name|description|reduction|study|output)\b|control\.(?!outputs)|time\.(solver|rtol|reproducible)"
-    r"|effects\.finite_strain\.tol|tissue\.(read_limit|repair|seam)"
+    r"|effects\.finite_strain\.tol|tissue\.read_limit"
 )
 MATERIAL = re.compile(r"tissue\.(layers\.[^.]+\.)?material\b|tissue\.layers\.[^.]+\.beta|effects\.damping\.(kind|beta)")
 MOTION = re.compile(r"(motion|time)\b")

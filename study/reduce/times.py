@@ -96,11 +96,12 @@ class Turns:
     def sentence(self, own: float, others: str) -> str:
         """The headline: speed and error in one sentence, or that there is none. ``others``: error at new materials."""
         error = f"error {own:.2%} at the scene's parameter, {others}"
-        quartiles = f"(median and quartiles of {self.rounds} rounds, processor time of both in turn)"
-        again, new = f"{self.again} times as fast as the full model", f"{self.new} at a new parameter"
+        how = f"quartiles of {self.rounds} rounds, processor time of both in turn"
         if self.steady:
-            return f"It runs {again}, {new} {quartiles}; {error}."
-        return f"The times scatter too much to name a speed-up: {again}, {new} {quartiles}; {error}."
+            again = f"{self.again} times as fast as the full model, {self.new} at a new parameter"
+            return f"It runs {again} (median and {how}); {error}."
+        again, new = (f"{x.low:.3g} to {x.high:.3g} times as fast" for x in (self.again, self.new))
+        return f"The times scatter too much to name a speed-up ({again}, at a new parameter {new}: {how}); {error}."
 
 
 def in_turn(model: Model, again: Callable[[], object], new: Callable[[], object]) -> Turns:
