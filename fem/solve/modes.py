@@ -8,7 +8,7 @@ from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc
-from softgrasp.fem.solve.solvers import FEW_LIMIT, SolverName, TissueSolver
+from softgrasp.fem.solve.solvers import ITERATIVE, TissueSolver, choose_solver
 from softgrasp.fem.solve.stiffness import factored_stiffness
 from softgrasp.fem.system import BlockSystem
 
@@ -39,8 +39,8 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
     key = (system.K_ee.handle, system.K_ee.stateGet(), system.M_ee.handle, system.M_ee.stateGet())
     kept = system.kept.get("modes")
     if kept is None or kept[0] != key or len(kept[1]) < k:
-        name: SolverName = "cholesky" if n_e <= FEW_LIMIT[system.layout.dimension] else "mumps"
-        with factored_stiffness(system, name) as solver:
+        name = choose_solver(system.layout, few=True)[0]  # as for static solves, whose factor is this one
+        with factored_stiffness(system, "mumps" if name in ITERATIVE else name) as solver:
             kept = key, *_lowest(system, solver, k), system.K_ee, system.M_ee  # none else can take their handles
         if system.M_ee.getType() != PETSc.Mat.Type.PYTHON and k * n_e <= KEPT_ENTRIES:
             system.kept["modes"] = kept
