@@ -84,7 +84,8 @@ def run_query(
         raise SceneError(f"{path} {what}; name the certified model that softgrasp reduce SCENE --tolerance wrote")
     model = load_certified(path)
     many = [materials_of(model, setting) for setting in questions]
-    drive = drive_of(model, motion, dt, len(many))
+    with raise_on_all_ranks(MPI.COMM_WORLD):  # free memory and files differ between machines
+        drive = drive_of(model, motion, dt, len(many))
     with raise_on_all_ranks(MPI.COMM_WORLD):
         if folder is not None and MPI.COMM_WORLD.rank == 0:
             read = [file for file in (path, motion, scene, batch) if file is not None]
