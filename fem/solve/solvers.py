@@ -38,8 +38,8 @@ REPEATED_RANKS = 4
 DIRECT_RESIDUAL = 1e-8
 DIRECT_ERROR = 1e-6
 OUT_OF_MEMORY = 3  # PC_FACTOR_OUTMEMORY
-# Percent beyond the estimate that MUMPS reserves on each rank. With PETSc's 20 one of four set-ups on two ranks of a busy
-# machine failed, for a cause that was not found; pages that are not touched cost nothing.
+# Percent beyond the estimate that MUMPS reserves on each rank. With PETSc's 20 one of four set-ups on two ranks of a
+# busy machine failed, for a cause that was not found; pages that are not touched cost nothing.
 WORKSPACE = 100
 PACKAGES = {"petsc": "PETSc", "mumps": "MUMPS"}  # PETSc's names of those that factor
 
