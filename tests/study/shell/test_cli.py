@@ -180,7 +180,8 @@ def test_an_argument_that_is_no_text_is_one_sentence(tmp_path: Path) -> None:
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_job_that_is_told_to_end_goes_on_later(tmp_path: Path, ranks: int) -> None:
     """SIGTERM to the program or to its launcher, as a cluster sends it before it kills."""
-    keys = ("tissue.cells=[12,24]", "time.steps=100000", "output.snapshots='none'", "output.fields='none'")
+    # steps for half a minute on a quiet core: the signal must come before their end
+    keys = ("tissue.cells=[40,80]", "time.steps=200000", "output.snapshots='none'", "output.fields='none'")
     words = ["simulate", str(FORWARD), "--out", str(tmp_path), *(w for key in keys for w in ("--set", key))]
     command = [*launched(ranks), "-m", "softgrasp.study.cli", *words, "--no-pictures"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
@@ -194,7 +195,7 @@ def test_a_job_that_is_told_to_end_goes_on_later(tmp_path: Path, ranks: int) -> 
     assert "lets --resume go on from there" in message, message
     assert (tmp_path / "checkpoint" / "checkpoint.json").exists()
     assert not (tmp_path / "softgrasp.lock").exists()
-    again = softgrasp(*words, "--resume", "--no-pictures", "--until", "99999", ranks=3 - ranks)
+    again = softgrasp(*words, "--resume", "--no-pictures", "--until", "199999", ranks=3 - ranks)
     assert again.returncode == 1
     assert f"was written on {ranks} rank" in again.stderr
     assert "n_e" not in again.stdout  # refused before anything was built
