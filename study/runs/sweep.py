@@ -22,7 +22,7 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.owned import note, remove_own
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.fem.scene.file import load_scene
+from softgrasp.fem.scene.file import load_scene, unit_of
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.reduce import reduce_linear
@@ -30,6 +30,7 @@ from softgrasp.reduction.replay import errors_linear, full_run, replay_linear
 
 METHOD = "craig_bampton"  # needs no snapshots of the other values, and is stable at all of them
 MOST = 100_000  # points: each is a run
+DECADE = 10.0  # ratio of the largest listed value to the least from which an axis is logarithmic
 FORM = "write KEY=FIRST:LAST:COUNT, KEY=FIRST:LAST:COUNT:log or KEY=A,B,C, as in tissue.material.mu=100:500:9"
 
 
@@ -37,9 +38,15 @@ FORM = "write KEY=FIRST:LAST:COUNT, KEY=FIRST:LAST:COUNT:log or KEY=A,B,C, as in
 class SweepAxis:
     """One key and its values."""
 
-    key: str
-    values: tuple[float, ...]
-    log: bool = False
+    key: str  # of the scene
+    values: tuple[float, ...]  # in its unit
+    log: bool = False  # whether its axis is logarithmic
+
+
+def axis_label(key: str) -> str:
+    """The last word of a key with its unit, "mu [Pa]"."""
+    name, unit = key.rsplit(".", 1)[-1], unit_of(key)
+    return f"{name} [{unit}]" if unit else name
 
 
 def parse_axis(text: str) -> SweepAxis:
@@ -63,6 +70,7 @@ def parse_axis(text: str) -> SweepAxis:
     if not good:
         raise SceneError(f"'{shortened(text)}' is no sweep; {FORM}")
     whole = all(x == int(x) for x in values) and "." not in right and "e" not in right.lower()
+    log = log or (len(parts) == 1 and min(values) > 0 and max(values) >= DECADE * min(values))
     return SweepAxis(key, tuple(int(x) for x in values) if whole else tuple(values), log)
 
 
