@@ -182,7 +182,7 @@ class Scene(Section):
     motion: Motion = Field(default_factory=lambda: Motion(profile="hold"))
     """motion of the hand, or force on it [m, rad, s]"""
     obstacle: Dropped[Annotated[list[Obstacle], Field(min_length=1)]] = Field(None)
-    """rigid obstacles, each a table [[obstacle]] [m]; none unless given"""
+    """rigid obstacles, a table each [m]; none unless given"""
     time: Time
     """time grid and solver [s]"""
     control: Dropped[Control] = Field(None)
