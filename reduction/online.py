@@ -7,8 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgrasp.fem.columns import TURNS
+from softgrasp.fem.labelled import Labelled, Quantity, of_hand
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.reduced import march_together
+from softgrasp.fem.shown import Card, Shown, amount, counted, listed
 from softgrasp.reduction.model import ModelError, ReducedSystem, UnstableModelError
 from softgrasp.reduction.propagator import Propagator, propagator
 
@@ -17,8 +20,8 @@ from softgrasp.reduction.propagator import Propagator, propagator
 TOGETHER = 5_000_000
 
 
-@dataclass(frozen=True)
-class ReducedTrajectory:
+@dataclass(frozen=True, repr=False)
+class ReducedTrajectory(Shown, Labelled):
     """What a reduced run returns."""
 
     times: Array  # (steps + 1,) [s]
@@ -27,6 +30,25 @@ class ReducedTrajectory:
     v_s: Array  # velocity of the hand, (steps + 1, n_s) [m/s, rad/s]
     outputs: Array  # y, (steps + 1, p) [m]
     output_names: tuple[str, ...]  # one per component
+
+    def card(self) -> Card:
+        """Steps, dimension and outputs."""
+        rows = (
+            ("time", f"{counted(len(self.times) - 1, 'step')} to {amount(self.times[-1], 's')}"),
+            ("dimension", f"N = {self.x.shape[1]}"),
+            ("outputs", listed(self.output_names)),
+        )
+        return Card("Trajectory of a reduced model", rows)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Outputs and hand over time with their labels and units."""
+        units = tuple("rad" if name.rsplit("_", 1)[-1] in TURNS else "m" for name in self.output_names)
+        return {
+            "outputs": Quantity(self.outputs, self.output_names, units, "output"),
+            "q_s": of_hand(self.q_s, self.output_names),
+            "v_s": of_hand(self.v_s, self.output_names, rate="/s"),
+        }
 
 
 def _check_stable(step: Propagator, allow_unstable: bool) -> None:

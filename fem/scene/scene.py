@@ -17,6 +17,7 @@ from pydantic import ConfigDict, Field, PrivateAttr, model_validator
 
 from softgrasp.fem.scene.control import BASES, Control, ControlOutput, Loop, Reduction, Study
 from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, NonNegative, Positive, Section, Tissue
+from softgrasp.fem.shown import Card, Shown, brief, listed
 
 __all__ = [
     "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Loop", "Material",
@@ -156,7 +157,7 @@ class Output(Section):
     )
 
 
-class Scene(Section):
+class Scene(Shown, Section):
     """A whole scene; relative file names start in `directory`.
 
     >>> import softgrasp as sg
@@ -192,6 +193,21 @@ class Scene(Section):
     """results that are kept [no unit]"""
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
     _mesh_digest: str = PrivateAttr("")  # of the mesh file, once it was read
+
+    def card(self) -> Card:
+        """Purpose, body, effects, motion and steps."""
+        tissue, on = self.tissue, [name for name, value in self.effects if value not in (None, False)]
+        body = (
+            tissue.mesh
+            or f"{listed(f'{x:g} m' for x in tissue.size or ())}, cells {listed(map(str, tissue.cells or ()))}"
+        )
+        rows = (
+            ("purpose", brief(self.description)),
+            ("body", f"{body}, P{tissue.order}"),
+            ("effects", listed(on)),
+            ("motion", f"{self.motion.profile}, {self.time.steps} steps to {self.time_end:g} s"),
+        )
+        return Card(f"Scene {self.name}", rows)
 
     @property
     def directory(self) -> Path:

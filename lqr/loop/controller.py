@@ -17,6 +17,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.reduced import midpoint_map
+from softgrasp.fem.shown import Card, Shown, amount, counted, listed
 from softgrasp.lqr.loop.small import SmallPlant
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
@@ -46,8 +47,8 @@ def _sorted(layout: BlockLayout) -> tuple[NDArray[np.int64], str] | None:
     return np.asarray((order[:, None] * d + np.arange(d)).ravel()), digest.hexdigest()
 
 
-@dataclass
-class Controller:
+@dataclass(repr=False)
+class Controller(Shown):
     """u = clip(u_bar + K (x - x_bar)) for x = [q_s, v_s, eta, eta'], with eta = W'z a few numbers of the tissue.
 
     A robot measures its hand, not the tissue. ``step`` therefore carries eta itself, without an observer: the tissue
@@ -85,6 +86,16 @@ class Controller:
     """Digest of the mesh's free nodes; empty when unknown."""
     about: dict[str, Any] = field(default_factory=dict)
     """Method, weights and output names, as free text."""
+
+    def card(self) -> Card:
+        """Dimension, rate, limits and target."""
+        rows = (
+            ("dimension", f"N = {self.plant.N}, {counted(len(self.u_bar), 'input')}"),
+            ("rate", f"{1 / self.period:.4g} Hz"),
+            ("limits", "none" if self.limits is None else listed(amount(x) for x in self.limits)),
+            ("hand at rest", listed(amount(x) for x in self.x_bar[: len(self.u_bar)])),
+        )
+        return Card("Controller u = u_bar + K (x - x_bar)", rows)
 
     def __post_init__(self) -> None:
         n_s, N = self.plant.B.shape[1], self.plant.N
