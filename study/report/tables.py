@@ -15,6 +15,7 @@ import rich.table
 from rich.console import Console
 from rich.markup import escape
 
+from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.owned import note
 from softgrasp.study.report.page import NUMBERS, Section, cell_text
 
@@ -113,7 +114,7 @@ def show_sections(console: Console, sections: Sequence[Section]) -> None:
     shown = [s for s in sections if s.terminal]
     for part in shown:
         if part.title and len(shown) > 1:
-            console.print(part.title, style="bold", markup=False)
+            console.print(f"\n{part.title}", style="bold", markup=False)
         if part.header:
             _show_table(console, part)
         elif part.rows:
@@ -133,9 +134,9 @@ def _show_table(console: Console, part: Section) -> None:
     table = cut.terminal(wrap=range(len(cut.header)), width=console.width)
     table.collapse_padding = True
     console.print(table)
-    left = {"rows": len(part.rows) - len(rows), "columns": len(header) - len(cut.header)}
+    left = {"row": len(part.rows) - len(rows), "column": len(header) - len(cut.header)}
     if any(left.values()):
-        more = listed([f"{count} more {what}" for what, count in left.items() if count])
+        more = listed([counted(count, f"more {what}") for what, count in left.items() if count])
         console.print(f"... and {more}", style="dim")
 
 

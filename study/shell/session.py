@@ -79,8 +79,7 @@ class Session:
         Raises SceneError: the file or a key is wrong, or the folder holds another run.
         """
         scene = load_scene_collective(self.comm, self.path, self.overrides)
-        named = [file for file in (scene.tissue.mesh, scene.motion.csv) if file is not None]
-        self.claim(scene.name, lambda: [find_scene(self.path), *map(scene.path, named)])
+        self.claim(scene.name, lambda: [find_scene(self.path), *scene.files])
         described = f": {escape(scene.description)}" if scene.description else ""
         self.console.print(f"[bold]{escape(scene.name)}[/bold]{described}", soft_wrap=True)
         return scene
