@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from softgrasp.fem.columns import TURNS
 from softgrasp.fem.labelled import Labelled, Quantity, of_hand
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.shown import Card, Shown, amount, counted, listed
+from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
 from softgrasp.reduction.model import ModelError, ReducedSystem, UnstableModelError
 from softgrasp.reduction.propagator import Propagator, march, march_together, propagator
 
@@ -38,6 +39,10 @@ class ReducedTrajectory(Shown, Labelled):
             ("outputs", listed(self.output_names)),
         )
         return Card("Trajectory of a reduced model", rows)
+
+    def plot(self) -> Any:
+        """Hand and outputs over time, as ``matplotlib`` figure."""
+        return drawn("reduced", self)
 
     @property
     def quantities(self) -> dict[str, Quantity]:
