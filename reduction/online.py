@@ -11,9 +11,10 @@ import numpy as np
 from softgrasp.fem.columns import TURNS
 from softgrasp.fem.labelled import Labelled, Quantity, of_hand
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.reduced import march_together
 from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
 from softgrasp.reduction.model import ModelError, ReducedSystem, UnstableModelError
-from softgrasp.reduction.propagator import Propagator, march, march_together, propagator
+from softgrasp.reduction.propagator import Propagator, propagator
 
 # byte of the matrices of a batch up to which all models step together; somewhere between 4 and 11 MB they leave the
 # cache, and one model after the other is faster (docs/benchmarks.md)
@@ -97,7 +98,7 @@ def run(
     if hand is None and (inputs.ndim != 2 or inputs.shape[1] != model.n_s or len(inputs) < 1):
         raise ModelError(f"the force has the shape {inputs.shape}; it must be (steps, {model.n_s})")
     start = np.zeros(model.N) if x0 is None else np.asarray(x0, dtype=float)
-    w = march(step, inputs, step.at.X_inverse @ start[model.N - step.size :])
+    w = step.march(inputs, step.at.X_inverse @ start[model.N - step.size :])
     return trajectory(step, w, hand)
 
 
@@ -237,7 +238,7 @@ def run_batch(
     many = len(steps) > 1
     rest, alone = np.zeros(steps[0].size), all(s.modal is not None for s in steps)
     if many and (alone or sum(s.block.nbytes for s in steps) > TOGETHER):
-        states: Iterable[Array] = (march(s, inputs, rest) for s, inputs in zip(steps, u, strict=True))
+        states: Iterable[Array] = (s.march(inputs, rest) for s, inputs in zip(steps, u, strict=True))
     else:
         states = march_together(steps, u, rest)
     return [trajectory(steps[i if many else 0], w, own[i]) for i, w in enumerate(states)]

@@ -16,6 +16,7 @@ from softgrasp.fem.errors import no_pipe, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.reduced import midpoint_map
 from softgrasp.fem.shown import Card, Shown, amount, counted, listed
 from softgrasp.lqr.loop.small import SmallPlant
 from softgrasp.lqr.plant.checks import ControlError
@@ -195,10 +196,10 @@ def _tissue_step(plant: SmallPlant, period: float) -> tuple[Array, Array, Array 
     """
     n_s = plant.B.shape[1]
     e, v = slice(2 * n_s, None), slice(n_s, 2 * n_s)
-    left, right = plant.E[e, e] - period / 2 * plant.A[e, e], plant.E[e, e] + period / 2 * plant.A[e, e]
-    columns = np.hstack([right, -plant.E[e, v], period / 2 * plant.A[e, v], period * plant.f[e, None]])
-    k = len(left)
-    parts = np.split(np.linalg.solve(left, columns), [k, k + n_s, k + 2 * n_s], axis=1)
+    loads = np.hstack([-plant.E[e, v] / period, plant.A[e, v] / 2, plant.f[e, None]])
+    k = len(loads)
+    moved = midpoint_map(plant.E[e, e], plant.A[e, e], loads, period)
+    parts = np.split(moved, [k, k + n_s, k + 2 * n_s], axis=1)
     step, accelerated, dragged, constant = (np.ascontiguousarray(part) for part in parts)
     return step, accelerated, dragged if plant.A[e, v].any() else None, constant[:, 0].copy()
 
