@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.columns import TURNS, hand_columns
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.shown import Card, Shown, listed
+from softgrasp.fem.shown import Card, Shown, drawn, listed
 from softgrasp.reduction.bases.basis import ReductionError
 
 
@@ -46,6 +46,10 @@ class LTI(Shown):
         return np.asarray(
             self.C @ np.linalg.solve(points * self.E - self.A, np.broadcast_to(self.B, (len(points), *self.B.shape)))
         )
+
+    def bode(self) -> Any:
+        """Gain and phase from each input to each output, as ``matplotlib`` figure."""
+        return drawn("lti_bode", self)
 
     def under(self, K: Array) -> LTI:
         """The closed loop u = K x + r with the extra load r as input. python-control's own functions take -K.

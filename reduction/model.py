@@ -4,20 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.material import LayerMaterial, in_words
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.shown import Card, Shown, amount, listed
+from softgrasp.fem.shown import Card, Shown, amount, drawn, listed
 from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError, Structure
 from softgrasp.reduction.canonical import canonical_operators
 from softgrasp.reduction.galerkin import galerkin_operators
 from softgrasp.reduction.lti import LTI, make_lti
 from softgrasp.reduction.operators import Operators, Parameters, Parts, Reconstruction
 from softgrasp.reduction.spectrum import Spectrum, spectrum
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
+    from softgrasp.fem.run.trajectory import Trajectory
 
 
 class ModelError(ReductionError):
@@ -224,6 +228,13 @@ class ReducedModel(Shown):
             ("outputs", listed(self.outputs.names)),
         )
         return Card(f"ReducedModel {self.name}", rows)
+
+    def plot_errors(self, model: Model, run: Trajectory) -> Any:
+        """Outputs of a full run and of this model, and their difference, as ``matplotlib`` figure. Collective.
+
+        Raises SoftgraspError: see :func:`softgrasp.reduction.reduce.replay`.
+        """
+        return drawn("model_errors", self, model, run)
 
     def at(self, materials: tuple[LayerMaterial, ...] | None = None, gravity: Array | None = None) -> ReducedSystem:
         """Assemble E x' = A x + B u + F g at new materials and gravity. Online; not collective.
