@@ -16,7 +16,7 @@ ITERATIVE = ("cg", "stars")
 Power = tuple[float, float]  # value at 1e5 unknowns, and exponent of the number of unknowns
 # Relative residual at which a step ends [1]. Smooth errors weigh little in the residual of a stiff matrix: of 276
 # random linear scenes cg left up to 3.6e-2 of the deformation at 1e-4, 9.3e-7 at 1e-8.
-STEP_RTOL: dict[SolverName, float] = {"cg": 1e-8, "stars": 1e-4}
+STEP_RTOL = {"cg": 1e-8, "stars": 1e-4}
 # Iterations of a step from the last solutions, over those from zero to 1e-8 [1].
 GUESSED = {"cg": 0.6, "stars": 0.3}
 FEW_SOLVES = 20  # solves of an equilibrium, a mesh estimate or modes with one factor [1]

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.solve.costs import ITERATIVE, STEP_RTOL
+from softgrasp.fem.solve.costs import STEP_RTOL
 
 LEAST_STEPS = 4  # of a run
 Refine = float | Literal["off", "scene"]
@@ -41,7 +41,7 @@ class Setting:
     @property
     def tolerance(self) -> float | None:
         """Relative residual at which a step ends [1]; None where the solver is direct or chosen by size."""
-        return self.rtol or STEP_RTOL[self.solver] if self.solver in ITERATIVE else None
+        return (self.rtol or STEP_RTOL[self.solver]) if self.solver in STEP_RTOL else None
 
     @property
     def entries(self) -> dict[str, Any]:
