@@ -31,7 +31,7 @@ def objects() -> dict[str, Any]:
     strained_run = sg.simulate(strained)
     strain_model = sg.reduce(strained, strained_run, N=14)
     return {
-        "scene": model.scene, "model": model, "run": run, "rom": rom, "system": rom.at(), "lti": rom.lti(),
+        "scene": model.scene, "model": model, "run": run, "rom": rom, "system": rom.at(),
         "replay": sg.replay(rom, model, run), "design": design, "controller": controller,
         "margins": loop_margins(controller), "problem": design.problem, "solution": design.solution, "loop": loop,
         "strained_run": strained_run, "strain_model": strain_model,
@@ -60,7 +60,9 @@ def test_cards_hold_the_numbers_of_the_objects(objects: dict[str, Any]) -> None:
     assert rows["unknowns"] == f"hand 2, tissue {objects['model'].system.layout.n_e}, {objects['model'].states} states"
     assert rows["effects"] == "damping"
     assert "2D, P1, 64 cells" in repr(objects["model"])  # 4 x 8 boxes of two triangles
-    poles = np.linalg.eigvals(np.linalg.solve(objects["lti"].E, objects["lti"].A)[4:, 4:])  # without the free hand
+    poles = np.linalg.eigvals(
+        np.linalg.solve(objects["system"].E, objects["system"].A)[4:, 4:]
+    )  # without the free hand
     assert f"spectral abscissa {poles.real.max():.3g} 1/s" in repr(objects["system"])
 
 

@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 ROOMS = {"fem": "Scene, model, run", "reduction": "Reduced models", "lqr": "Control"}
 MORE = {
     "fem": ["fem.fields.series.SeriesWriter"],
-    "reduction": ["reduction.model.ReducedModel", "reduction.model.ReducedSystem", "reduction.lti.LTI"],
+    "reduction": ["reduction.model.ReducedModel", "reduction.system.EnergySystem", "fem.reduced.ReducedSystem"],
     "lqr": ["lqr.loop.margins.loop_margins", "lqr.loop.margins.LoopMargins"],
 }
 
