@@ -17,7 +17,7 @@ from mpi4py import MPI
 from softgrasp.fem.columns import TURNS, Columns, hand_columns
 from softgrasp.fem.errors import SoftgraspError, SolverError
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.shown import Card, Shown, listed
+from softgrasp.fem.shown import Card, Shown, drawn, listed
 
 STEPS = 8  # in one product: more would not gain at N = 30, where a product costs as much as the call
 BLOCK_ENTRIES = 32_768  # of the matrix of several steps: 256 kB stay in a core's own cache
@@ -204,6 +204,10 @@ class ReducedSystem(StateSpace):
         return np.asarray(
             self.C @ np.linalg.solve(points * self.E - self.A, np.broadcast_to(self.B, (len(points), *self.B.shape)))
         )
+
+    def bode(self) -> Any:
+        """Gain and phase from each input to each output, as ``matplotlib`` figure."""
+        return drawn("system_bode", self)
 
     def under(self, K: Array) -> Self:
         """The closed loop u = K x + r with the extra load r as input. python-control's own functions take -K.

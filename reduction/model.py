@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgrasp.fem.material import LayerMaterial, in_words
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.shown import Card, Shown, listed
+from softgrasp.fem.shown import Card, Shown, drawn, listed
 from softgrasp.reduction.bases.basis import Coordinates, Frame, Structure
 from softgrasp.reduction.canonical import canonical_system
 from softgrasp.reduction.galerkin import galerkin_system
 from softgrasp.reduction.operators import Parameters, Parts, Reconstruction
 from softgrasp.reduction.system import EnergySystem, ModelError, Outputs
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
+    from softgrasp.fem.run.trajectory import Trajectory
 
 
 @dataclass(frozen=True, repr=False)
@@ -76,6 +80,13 @@ class ReducedModel(Shown):
             ("outputs", listed(self.outputs.names)),
         )
         return Card(f"ReducedModel {self.name}", rows)
+
+    def plot_errors(self, model: Model, run: Trajectory) -> Any:
+        """Outputs of a full run and of this model, and their difference, as ``matplotlib`` figure. Collective.
+
+        Raises SoftgraspError: see :func:`softgrasp.reduction.reduce.replay`.
+        """
+        return drawn("model_errors", self, model, run)
 
     def at(self, materials: tuple[LayerMaterial, ...] | None = None, gravity: Array | None = None) -> EnergySystem:
         """Assemble E x' = A x + B u + F g at new materials and gravity. Online; not collective.

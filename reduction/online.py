@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from softgrasp.fem.columns import TURNS
 from softgrasp.fem.labelled import Labelled, Quantity, of_hand
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.reduced import march_together
-from softgrasp.fem.shown import Card, Shown, amount, counted, listed
+from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
 from softgrasp.reduction.propagator import Propagator, propagator
 from softgrasp.reduction.system import EnergySystem, ModelError, UnstableModelError
 
@@ -39,6 +40,10 @@ class ReducedTrajectory(Shown, Labelled):
             ("outputs", listed(self.output_names)),
         )
         return Card("Trajectory of a reduced model", rows)
+
+    def plot(self) -> Any:
+        """Hand and outputs over time, as ``matplotlib`` figure."""
+        return drawn("reduced", self)
 
     @property
     def quantities(self) -> dict[str, Quantity]:

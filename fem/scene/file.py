@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from softgrasp import PACKAGE
 from softgrasp.fem.errors import SceneError, shortened
+from softgrasp.fem.scene.obstacles import replace_paths
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.text import check_values, parse_toml, read_text
 
@@ -47,6 +48,7 @@ _FORMS = {
     "contact.sides": 'sides = ["left", "right"]',
     "contact.box": "box = [[0, 0.09], [0.06, 0.12]]",
     "motion.target": "target = [0.3, 0.2]",
+    "obstacle": 'obstacle = [{ kind = "halfspace", normal = [0, 1], offset = -0.05 }]',
     "control.outputs": 'outputs = [{ kind = "node", point = [0.03, 0] }]',
 }
 
@@ -123,6 +125,7 @@ def resolved_toml(scene: Scene) -> str:
     for section, key in _FILES:
         if key in data[section]:
             data[section][key] = str(scene.path(data[section][key]))
+    replace_paths(data, lambda name: str(scene.path(name)))
     lines = [f"{key} = {toml_value(value)}" for key, value in data.items() if not isinstance(value, dict)]
     for section, table in data.items():
         if isinstance(table, dict):
@@ -249,6 +252,14 @@ def _model(annotation: Any) -> type[BaseModel] | None:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((model for part in get_args(annotation) if (model := _model(part))), None)
+
+
+def unit_of(key: str) -> str:
+    """Unit of a key, "Pa" of ``tissue.material.mu``; empty where it has none."""
+    *path, name = key.split(".")
+    description = "[Pa]" if name == "young" else _fields(path).get(name, (None, ""))[1]
+    unit = re.search(r"\[([^]]+)\]", description)
+    return unit[1] if unit is not None and unit[1] not in ("no unit", "1") else ""
 
 
 def _fields(path: Sequence[str]) -> dict[str, tuple[Any, str]]:

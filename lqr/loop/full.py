@@ -19,7 +19,7 @@ from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.snapshots import Snapshots, make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
-from softgrasp.fem.shown import Card, Shown, amount, counted, listed
+from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
 from softgrasp.fem.solve.solvers import Reproducible, SolverUsed, choose_solver
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import accumulated_cost
@@ -110,6 +110,10 @@ class LoopTrajectory(Shown, Labelled):
     def attributes(self) -> dict[str, Any]:
         """Cost and share of the steps with an input at its limit."""
         return {"cost": float(self.cost[-1]), "saturated": self.saturated}
+
+    def plot(self) -> Any:
+        """Outputs and inputs over time, as ``matplotlib`` figure."""
+        return drawn("loop", self)
 
     @property
     def output_names(self) -> tuple[str, ...]:

@@ -12,13 +12,14 @@ bounds what all inputs withstand at once: every gain in [1/(1+a), 1/(1-a)], ever
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.reduced import ReducedSystem
-from softgrasp.fem.shown import Card, Shown
+from softgrasp.fem.shown import Card, Shown, drawn
 from softgrasp.lqr.loop.controller import Controller
 
 POINTS = 4000  # frequencies, spaced evenly in log w: 0.3 % apart over five decades
@@ -54,6 +55,10 @@ class LoopMargins(Shown):
             for a in self.axes
         ]
         return Card("LoopMargins", (*rows, ("all at once", f"gain {low:.3g} to {high:.3g}, phase {phase:.3g} deg")))
+
+    def plot(self) -> Any:
+        """Gain and phase of the loop at each input, as ``matplotlib`` figure."""
+        return drawn("loop_bode", self)
 
     @property
     def together(self) -> tuple[float, float, float]:

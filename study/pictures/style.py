@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -15,7 +16,8 @@ from cycler import cycler
 from softgrasp.fem.owned import note
 from softgrasp.study.pictures import PDF
 
-mpl.use("Agg")
+if "inline" not in os.environ.get("MPLBACKEND", ""):  # a notebook shows figures by its own
+    mpl.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -103,8 +105,9 @@ def save(figure: Any, out_png: Path) -> tuple[Path, ...]:
     """Write the figure as PNG and, where :data:`PDF` is set, beside it as PDF; close it and return the names."""
     files = (out_png, out_png.with_suffix(".pdf")) if PDF.get() else (out_png,)
     note(*files)
-    for file in files:
-        figure.savefig(file, bbox_inches="tight", pad_inches=0.04)
+    with paper_style():
+        for file in files:
+            figure.savefig(file, bbox_inches="tight", pad_inches=0.04)
     plt.close(figure)
     return files
 
