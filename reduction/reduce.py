@@ -76,6 +76,7 @@ def reduce(
         ReductionError: a model at finite strain with a linear one's options, or no weights reach their tolerance.
         SolverError: a factorisation failed, or a reduced run did not converge.
     """
+    model.scene.refuse_contact("a reduced model")
     fulls = [as_full(model, run) for run in ([runs] if isinstance(runs, Trajectory | FullRun) else runs)]
     if model.system.points is None:
         return reduce_linear(model, fulls, method or "psd_fixed", N, inner, engine)

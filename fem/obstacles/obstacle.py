@@ -15,8 +15,8 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.table import read_csv
 
 Array = NDArray[Any]
-Path = Callable[[float], Array]
-"""Displacement (d,) [m] of an obstacle at a time [s]."""
+Path = Callable[[float, int], Array]
+"""Displacement (d,) [m] of an obstacle at a time [s], or its derivative of a given order."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,11 @@ class Obstacle:
 
     def shift(self, t: float) -> Array | float:
         """Displacement at a time [m], (d,), or 0 for a fixed one."""
-        return 0.0 if self.path is None else self.path(t)
+        return 0.0 if self.path is None else self.path(t, 0)
+
+    def rate(self, t: float) -> Array | float:
+        """Velocity at a time [m/s], (d,), or 0 for a fixed one."""
+        return 0.0 if self.path is None else self.path(t, 1)
 
     def look(self, x: Array, t: float = 0.0) -> tuple[Array, Array]:
         """Gap (m,) [m] of points x (m, d) [m] at a time and its gradient, the outward unit normal (m, d)."""
@@ -47,6 +51,21 @@ class Obstacle:
     def support(self, n: Array, t: float = 0.0) -> float:
         """Largest n.y [m] over the obstacle at a time: points with n.x >= support are outside of it."""
         return self.shape.support(n) + float(np.sum(n * self.shift(t)))
+
+
+def mean_normal(shape: Shape, begin: Array, end: Array, straight: float) -> Array:
+    """Normals n (k, d) between points with n.(end - begin) = change of the gap, so that forces along n do exact work.
+
+    The normal in the middle, corrected along the motion as a discrete gradient is [Gonzalez96]; that at the end where a
+    point moves by less than ``straight`` [m].
+    """
+    (g0, _), (g1, last) = shape.look(begin), shape.look(end)
+    step = end - begin
+    square = np.einsum("ij,ij->i", step, step)
+    turns = square > straight**2
+    normal = np.where(turns[:, None], shape.look((begin + end) / 2)[1], last)
+    lacks = np.where(turns, g1 - g0 - np.einsum("ij,ij->i", normal, step), 0.0)
+    return np.asarray(normal + (lacks / np.where(turns, square, 1.0))[:, None] * step)
 
 
 def make_obstacles(scene: Scene, d: int) -> tuple[Obstacle, ...]:
@@ -77,9 +96,9 @@ def make_path(scene: Scene, entry: keys.Obstacle, key: str, d: int) -> Path | No
         return None
     if entry.path.csv is None:
         velocity = np.array(entry.path.velocity, dtype=float)
-        return lambda t: t * velocity
+        return lambda t, order: velocity if order else t * velocity
     from scipy.interpolate import CubicSpline  # few scenes need it
 
     times, values = read_csv(scene.path(entry.path.csv), d, scene.time_end, key, "one displacement per axis")
     spline = CubicSpline(times, values, bc_type="clamped")
-    return lambda t: np.asarray(spline(t))
+    return lambda t, order: np.asarray(spline(t, order))

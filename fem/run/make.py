@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.run.inexact import InexactMidpoint
 from softgrasp.fem.run.midpoint import TissueMidpoint
 from softgrasp.fem.solve.costs import STEP_RTOL
@@ -10,12 +11,27 @@ from softgrasp.fem.system import BlockSystem
 
 
 def make_midpoint(
-    system: BlockSystem, dt: float, solver: SolverName, rtol: float | None = None, reproducible: Reproducible = "auto"
+    system: BlockSystem,
+    dt: float,
+    solver: SolverName,
+    rtol: float | None = None,
+    reproducible: Reproducible = "auto",
+    touching: bool = False,
 ) -> TissueMidpoint:
     """The step of a system, linear or of finite strain; arguments as for `TissueMidpoint`. Collective.
 
     ``rtol``: None for that of the solver, `STEP_RTOL`; Newton's method, which has a tolerance of its own, takes 1e-4.
+    ``touching``: contact with obstacles acts on the step. Raises SolverError: the solver cannot do that.
     """
+    if touching:
+        if solver in ITERATIVE:
+            raise SolverError(
+                f"contact needs a factor of the step, and '{solver}' has none; take time.solver = 'mumps' and "
+                "the memory for it, or a coarser mesh"
+            )
+        from softgrasp.fem.run.contact_step import ContactMidpoint  # only scenes with contact pay for it
+
+        return ContactMidpoint(system, dt, solver, reproducible=reproducible)
     if rtol is None:
         rtol = STEP_RTOL["stars"] if system.points is not None else STEP_RTOL.get(solver, STEP_RTOL["cg"])
     if system.points is None and solver in ITERATIVE:

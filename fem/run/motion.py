@@ -221,7 +221,7 @@ class ForceDrive:
             )
 
 
-def force_taken(system: BlockSystem, pulls: Array, v: Array, c: Array, dt: float) -> Array:
+def force_taken(system: BlockSystem, pulls: Array, v: Array, c: Array, dt: float, kicks: Array | float = 0.0) -> Array:
     """Mean force u [N, N m] in each step that leads the hand against inertia and tissue, shape (steps, n_s).
 
         u = M_hand a + M_rigid (a - g + alpha v_mid) + G' (z'' + alpha z'_mid) - weight
@@ -235,11 +235,12 @@ def force_taken(system: BlockSystem, pulls: Array, v: Array, c: Array, dt: float
         v: velocity of the hand, (steps + 1, n_s).
         c: load of each step, -(a - g + alpha v_mid), (steps, n_s).
         dt: step [s].
+        kicks: jumps of G'z' at the end of each step, (steps, n_s), of impulses.
     """
     s = 2 / dt
     turn = np.where(np.arange(len(pulls) + 1) % 2 == 0, 1.0, -1.0)[:, None]
     rates, n_s = np.zeros_like(v), v.shape[1]
     work, speed = pulls[:, :n_s], pulls[:, -n_s:]
-    rates[1:] = -turn[1:] * np.cumsum(turn[:-1] * (2 * s * speed), axis=0)
-    tissue = s * (s * speed - rates[:-1]) + system.damping.drag * s * work
+    rates[1:] = -turn[1:] * np.cumsum(turn[:-1] * (2 * s * speed + kicks), axis=0)
+    tissue = s * (s * speed - rates[:-1]) + system.damping.drag * s * work + kicks / dt
     return np.asarray(np.diff(v, axis=0) / dt @ system.M_hand.T - c @ system.M_rigid.T + tissue - system.weight)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -28,17 +28,20 @@ from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.owned import locked
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
+from softgrasp.fem.run.frames import frame_steps, output_recorders
 from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.motion import Force, ForceDrive, TableDrive, force_taken, force_values, free_table
 from softgrasp.fem.run.snapshots import make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
 
-FRAMES, LIGHT, FEWEST = 60, 100_000, 10  # frames up to LIGHT unknowns, these unknowns, fewest frames beyond [1]
+if TYPE_CHECKING:
+    from softgrasp.fem.run.contact import Contact
+    from softgrasp.fem.run.contact_step import ContactDrive
+
 Observer = Callable[["Run"], None]
 """Called between segments and at every frame; collective, may raise to end the run."""
 
@@ -75,33 +78,27 @@ class Run(Stepped):
         self.end = scene.time_end
         dt, (name, reason) = self.end / scene.time.steps, solver_of(scene, system.layout)
         with model.watch.stage("factor"):
-            midpoint = make_midpoint(system, dt, name, scene.time.rtol, scene.time.reproducible)
+            grid = scene.time
+            midpoint = make_midpoint(system, dt, name, grid.rtol, grid.reproducible, scene.effects.obstacles)
         self.name: str = system.layout.comm.bcast(secrets.token_hex(6))
         kept, fresh = scene.output, None if options.resume else self.name
         store = make_store(system, kept.snapshots, scene.time.steps, kept.every, options.directory, fresh, options.few)
         super().__init__(system.layout, dt, scene.time.steps, midpoint, store, midpoint.solver.used(reason))
         self.outputs: tuple[Output, ...] = make_outputs(scene, system)
         self.local_outputs = np.zeros((self.steps + 1, sum(o.size for o in self.outputs)))
-        self.points, self.regions = self._recorders()
-        self.drive = self._make_drive(force)
+        self.points, self.regions = output_recorders(self.outputs, self.local_outputs)
+        self.drive: TableDrive | ForceDrive | ContactDrive = self._make_drive(force)
+        self.contact: Contact | None = None
+        if scene.effects.obstacles:
+            from softgrasp.fem.run.contact_step import make_contact  # only scenes with contact pay for it
+
+            self.drive, self.contact = make_contact(model, midpoint, self.drive, self.steps)
         self.pulls = np.zeros((self.steps + 1, len(midpoint.pull())))
         self.milestones = set(np.linspace(0, self.steps, 11).round().astype(int).tolist())
         self.initial_energy = self.peak_energy = 0.0
         self.residual_first = self.residual_last = 0.0
         self.begun, self.legs = 0, [0]
         self.beside: dict[str, str] = {}
-
-    def _recorders(self) -> tuple[list[tuple[slice, Array]], list[tuple[np.ndarray, Array]]]:
-        """Local dofs and column block of every output that this rank has a share in."""
-        points, regions, at = [], [], 0
-        for output in self.outputs:
-            share = self.local_outputs[:, at : at + output.size]
-            if len(output.dofs) == 1 and (np.diff(output.dofs[0]) == 1).all():  # a slice, cheaper than indices
-                points.append((slice(output.dofs[0][0], output.dofs[0][-1] + 1), share))
-            elif len(output.dofs):
-                regions.append((output.dofs, share))
-            at += output.size
-        return points, regions
 
     def _make_drive(self, force: Force | None) -> TableDrive | ForceDrive:
         scene, system = self.model.scene, self.model.system
@@ -133,6 +130,8 @@ class Run(Stepped):
             with self.model.watch.stage("equilibrium"):
                 name, _ = choose_solver(system.layout, scene.time.solver, few=True)
                 self.state.z.array_w[:] = equilibrium(system, name, scene.time)
+        if self.contact is not None:
+            self.contact.start(self.state, self.drive.q[0])
         self.midpoint.start(self.state)
         self.record(0)
         self.initial_energy = self.midpoint.energy(self.state)
@@ -162,8 +161,10 @@ class Run(Stepped):
         """Force on the hand in each step, see :class:`Trajectory`. Collective."""
         if self.drive.u is not None:
             return self.drive.u
+        kicks = 0.0 if self.contact is None else self.contact.table.kick
         pulls = self.pulls[1:] if self.midpoint.operators.whole else total(self.layout.comm, self.pulls[1:])
-        return force_taken(self.model.system, pulls, self.drive.v, self.drive.c, self.dt)
+        hand = 0.0 if self.contact is None else self.contact.table.hand
+        return force_taken(self.model.system, pulls, self.drive.v, self.drive.c, self.dt, kicks) - hand
 
     def watch_energy(self) -> None:
         """Sample the energy for the scale of the drift, and stop a run that is no longer finite. Collective."""
@@ -175,10 +176,11 @@ class Run(Stepped):
         self.peak_energy = max(self.peak_energy, abs(energy))
 
     def balance(self) -> tuple[float, float]:
-        """Work sum_n 2 c_n'G'w_n of the loads and energy dissipated since the start [J]. Collective."""
+        """Work of loads, sum_n 2 c_n'G'w_n, and contact, and energy dissipated since the start [J]. Collective."""
         n = self.reached
         work = 2 * float(np.einsum("ij,ij", self.drive.c[:n], self.pulls[1 : n + 1, : self.layout.n_s]))
-        return self.midpoint.over_ranks(work), self.midpoint.over_ranks(self.midpoint.dissipated)
+        contact = 0.0 if self.contact is None else float(self.contact.table.energy[0])
+        return self.midpoint.over_ranks(work) + contact, self.midpoint.over_ranks(self.midpoint.dissipated)
 
     def drift(self) -> float:
         """Energy that neither load nor damping explains, over the largest energy seen. Collective."""
@@ -239,6 +241,8 @@ class Run(Stepped):
         for vector in (self.state.z, self.state.v, midpoint.r):
             vector.stateIncrease()
         midpoint.adopt(self.state)
+        if self.contact is not None:
+            self.contact.start(self.state, self.drive.q[n], n)
         midpoint.restore(saved.solver_rows, saved.solver_numbers)
 
     def trajectory(self) -> Trajectory:
@@ -266,19 +270,8 @@ class Run(Stepped):
             steps_timed=self.counted,
             force=self.force(),
             newton=self.midpoint.figures(),
+            contact=None if self.contact is None else self.contact.record(),
         )
-
-
-def frame_count(scene: Scene, n_e: int) -> int:
-    """Number of intervals between frames: ``output.frames``, or `FRAMES` to `LIGHT` unknowns, beyond like 1 / n_e."""
-    frames = scene.output.frames
-    return int(np.clip(FRAMES * LIGHT / n_e, FEWEST, FRAMES)) if frames == "auto" else frames
-
-
-def frame_steps(scene: Scene, n_e: int) -> list[int]:
-    """Steps at which ``RunOptions.frame`` is called, from start to end, with n_e unknowns of the tissue."""
-    steps = scene.time.steps
-    return np.linspace(0, steps, min(frame_count(scene, n_e), steps) + 1).round().astype(int).tolist()
 
 
 def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set[int]]:

@@ -16,6 +16,7 @@ from softgrasp.fem.solve.solvers import SolverUsed
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
+    from softgrasp.fem.run.contact_record import ContactRecord
     from softgrasp.fem.strain.newton import NewtonFigures
 
 
@@ -103,6 +104,9 @@ class Trajectory(Shown, Labelled):
         Raises SoftgraspError: the run kept no snapshots.
         """
         return drawn("animation", self, model)
+
+    contact: ContactRecord | None = None
+    """What obstacles did; None without effects.obstacles."""
 
     @property
     def output_names(self) -> tuple[str, ...]:

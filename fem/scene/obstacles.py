@@ -111,7 +111,10 @@ def check_obstacles(obstacles: list[Obstacle] | None, used: bool) -> None:
     if obstacles is None:
         return
     if not used:
-        raise ValueError("obstacle is given but nothing in this scene uses it; drop [[obstacle]]")
+        raise ValueError(
+            "obstacle is given but nothing in this scene uses it; set effects.obstacles = true for contact, or drop "
+            "[[obstacle]]"
+        )
     names = obstacle_names(obstacles)
     for i, name in enumerate(names):
         if name in names[:i]:

@@ -87,6 +87,7 @@ class Effects(Section):
     finite_strain: Dropped[FiniteStrain] = Field(
         None, description="large deformation, finite strain {law, tol [1]}; off unless given"
     )
+    obstacles: bool = Field(False, description="the tissue meets the obstacles, without friction [no unit]")
 
 
 class Motion(Section):
@@ -247,6 +248,16 @@ class Scene(Shown, Section):
         paths = [obstacle.path.csv for obstacle in self.obstacle or [] if obstacle.path is not None]
         return [self.path(name) for name in (self.tissue.mesh, self.motion.csv, *paths) if name is not None]
 
+    def refuse_contact(self, what: str) -> None:
+        """Say that contact is not part of what is asked for. Raises SceneError: ``effects.obstacles`` is on."""
+        if self.effects.obstacles:
+            from softgrasp.fem.errors import SceneError  # imports MPI, which the models do without
+
+            raise SceneError(
+                f"scene '{self.name}': {what} cannot go with effects.obstacles yet; take --set effects.obstacles=false "
+                "--set obstacle=false for a model without contact"
+            )
+
     @model_validator(mode="after")
     def _check(self) -> Scene:
         effects = self.effects
@@ -264,10 +275,28 @@ class Scene(Shown, Section):
         for name, layer in self.tissue.layers.items():
             if layer.beta is not None and effects.damping is None:
                 raise ValueError(f"tissue.layers.{name}.beta needs effects.damping; give it or drop beta")
-        check_obstacles(self.obstacle, used=False)
+        check_obstacles(self.obstacle, used=effects.obstacles)
+        if effects.obstacles:
+            _check_contact(self)
         if self.dimension is not None:
             _check_vectors(self, self.dimension)
         return self
+
+
+def _check_contact(scene: Scene) -> None:
+    """ValueError for what contact cannot go with."""
+    if scene.obstacle is None:
+        raise ValueError("obstacle is missing; effects.obstacles needs at least one [[obstacle]]")
+    if scene.tissue.refine is not None and scene.tissue.refine.tolerance is not None:
+        raise ValueError(
+            "tissue.refine.tolerance cannot go with effects.obstacles, which no estimate of it knows; drop it"
+        )
+    if scene.effects.finite_strain is not None:
+        raise ValueError("effects.obstacles cannot go with effects.finite_strain yet; set one of them to false")
+    if scene.time.solver in ("cg", "stars"):
+        raise ValueError(
+            f"time.solver is '{scene.time.solver}'; effects.obstacles needs a factor, take 'auto' or 'cholesky'"
+        )
 
 
 def _check_vectors(scene: Scene, d: int) -> None:

@@ -41,13 +41,14 @@ def problem(model: Model) -> RiccatiProblem:
     Without that table: the free node farthest from the hand, Q = R = 1. Collective.
 
     Raises:
-        SceneError: an output lies outside the body, or Q or R has the wrong size.
+        SceneError: an output lies outside the body, Q or R has the wrong size, or effects.obstacles is on.
 
     >>> import softgrasp as sg
     >>> problem = sg.problem(sg.build("paper_lqr", ["tissue.cells=[2, 4]"]))
     >>> problem.names
     ('tip_x', 'tip_y')
     """
+    model.scene.refuse_contact("control")
     model = checked_model(model)
     scene, system = model.scene, model.system
     outputs = make_outputs(scene, system)

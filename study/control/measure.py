@@ -16,7 +16,7 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import on_root
-from softgrasp.fem.run.simulate import frame_count
+from softgrasp.fem.run.frames import frame_count
 from softgrasp.lqr.dense.care import solve_reduced
 from softgrasp.lqr.design.controller import CertifiedController, NoController, certified_controller
 from softgrasp.lqr.design.duration import LoopPlan, largest_cost

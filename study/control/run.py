@@ -51,7 +51,9 @@ def run_control(
     middle of the box of lambda and mu, to compare re-tuned gains with.
     """
     session = Session("control", path, overrides, out, console, **flags)
-    model, sentence = with_control(session.model(session.scene(), steps=False))
+    scene = session.scene()
+    scene.refuse_contact("control")
+    model, sentence = with_control(session.model(scene, steps=False))
     if sentence:
         console.print(sentence, soft_wrap=True, markup=False)
     watch, layout = Stopwatch(session.comm), model.system.layout

@@ -64,6 +64,8 @@ def switch(scene: Scene, name: str, scales: Scales) -> Switch:
         table["effects"][name] = entry
         if name == "gravity":
             table["time"]["start"] = "rest" if on else "equilibrium"
+        elif name == "obstacles":
+            table.pop("obstacle")
         elif name == "damping" and on:
             for layer in table["tissue"]["layers"].values():
                 layer.pop("beta", None)
@@ -90,6 +92,8 @@ def _obstacle(scene: Scene, name: str, scales: Scales) -> str:
         return "there is no second material to try: layers cannot be invented"
     if name == "damping" and not on and scales.omega is None:
         return "the first frequency, which scales the trial value, is not computed"
+    if name == "obstacles" and not on:
+        return "there is no [[obstacle]] to try"
     if name == "rotation" and scene.motion.profile == "csv":
         return "the columns of motion.csv hold the angles" if on else "motion.csv has no columns for angles"
     return ""

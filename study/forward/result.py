@@ -19,6 +19,7 @@ from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.report.tables import Table
 
 if TYPE_CHECKING:
+    from softgrasp.fem.run.contact_record import ContactRecord
     from softgrasp.fem.strain.newton import NewtonFigures
 
 
@@ -99,6 +100,7 @@ class Simulation:
             "output_places": self.places,
             "energy_drift": run.energy_drift,
             **({} if run.newton is None else {"newton": newton_keys(run.newton)}),
+            **({} if run.contact is None else {"contact": contact_keys(run.contact)}),
             "force_peak": self.force_peak,
             "time": {
                 **stages,
@@ -122,6 +124,7 @@ class Simulation:
             *((c.label, f"{y:.6g} {c.unit}") for c, y in zip(run.columns, run.outputs[-1], strict=True)),
             *self.places.items(),
             ("largest force on the hand", ", ".join(loads)),
+            *([] if run.contact is None else contact_rows(run.contact)),
             ("energy drift", f"{run.energy_drift:.1e}"),
             *([("iterations", newton_text(run.newton))] if run.newton else []),
             ("residual, first and last", f"{run.residuals[0]:.1e}, {run.residuals[1]:.1e}"),
@@ -157,7 +160,53 @@ class Simulation:
         header = trajectory_header(n_s, self.dimension, run.columns, velocity=True)
         header += [f"{c.label} [{c.load_unit}]" for c in self.hand("force")]
         parts = [run.times, run.q_s, run.v_s, run.outputs, np.vstack([np.full(n_s, np.nan), run.force])]
+        if (contact := run.contact) is not None:
+            for o, name in enumerate(contact.names):
+                axes = "xyz"[: self.dimension]
+                header += [f"{name}_force_{axis} [N]" for axis in axes] + [f"{name}_gap [m]", f"{name}_touching [1]"]
+                steps = np.column_stack([contact.force[:, o], contact.gap[1:, o], contact.touching[:, o]])
+                parts.append(np.vstack([[*[np.nan] * self.dimension, contact.gap[0, o], 0.0], steps]))
         return Table(tuple(header), np.column_stack(parts).tolist())
+
+
+def contact_keys(contact: ContactRecord) -> dict[str, Any]:
+    """What obstacles did, for result.json: forces [N], gaps [m], energies [J]."""
+    return {
+        "penetration": contact.penetration,
+        "work": contact.work,
+        "taken_by_touch": contact.touch,
+        "taken_by_impulses": contact.stopped,
+        "rounds": contact.rounds,
+        "columns": contact.columns,
+        "boundary_nodes": contact.nodes,
+        "obstacles": {
+            name: {
+                "gap_min": float(contact.gap[:, o].min()),
+                "touch_share": float((contact.touching[:, o] > 0).mean()),
+                "force_max": float(np.linalg.norm(contact.force[:, o], axis=1).max()),
+                "force_end": contact.force[-1, o].tolist(),
+                "impulse": contact.impulse[:, o].sum(axis=0).tolist(),
+                "nodes_max": int(contact.touching[:, o].max()),
+            }
+            for o, name in enumerate(contact.names)
+        },
+    }
+
+
+def contact_rows(contact: ContactRecord) -> list[tuple[str, str]]:
+    """What obstacles did, in words: one row each, and the energy that they took."""
+    rows = []
+    for o, name in enumerate(contact.names):
+        count, gap = int(contact.touching[:, o].max()), float(contact.gap[:, o].min())
+        force = ", ".join(f"{x:.4g}" for x in contact.force[-1, o])
+        touched = (
+            f"force ({force}) N at the end, at most {counted(count, 'node')} touching"
+            if count
+            else f"never touched, least gap {gap:.3g} m: without the effect the run is the same"
+        )
+        rows.append((f"obstacle {name}", touched))
+    taken = f"{contact.touch:.3g} J at first touch, {contact.stopped:.3g} J by impulses"
+    return [*rows, ("taken by contact", f"{taken}; deepest penetration {contact.penetration:.1e} m")]
 
 
 def newton_keys(newton: NewtonFigures) -> dict[str, float]:

@@ -15,7 +15,8 @@ from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError, SolverError
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.run.checkpoint import check_ranks
-from softgrasp.fem.run.simulate import FRAMES, LIGHT, Run, RunOptions, frame_count, simulate
+from softgrasp.fem.run.frames import FRAMES, LIGHT, frame_count
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estimate_error
 from softgrasp.study.forward.cautions import looked_at, run_warnings
@@ -84,7 +85,9 @@ def run_simulate(
     result = simulate_result(model, run, run_warnings(model, run, frames.most[1:]))
     tables = {"trajectory.csv": result.trajectory()}
     session.keep(scene, result.to_json(), tables)
-    mesh_error, unknown = estimate_error(model, None if certify else SHARE * run_seconds(model))
+    mesh_error, unknown = None, "The error of the mesh is not known: its estimate has no contact."
+    if run.contact is None:
+        mesh_error, unknown = estimate_error(model, None if certify else SHARE * run_seconds(model))
     accuracy = accuracy_report(mesh_error, run)
     result = replace(result, warnings=(*result.warnings, *accuracy.warnings, *([unknown] if unknown else [])))
 

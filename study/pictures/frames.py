@@ -14,7 +14,8 @@ from softgrasp.fem.fields.vtu import note_of
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.owned import remove_own
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.simulate import Run, frame_steps
+from softgrasp.fem.run.frames import frame_steps
+from softgrasp.fem.run.simulate import Run
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.study.pictures.shapes import way_done
 

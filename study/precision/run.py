@@ -64,6 +64,7 @@ def run_study(
     session = Session("study", path, overrides, out, console, quiet, empty=empty)
     request = Request(tolerance, budget, tuple(questions or ()))
     scene = session.scene()
+    scene.refuse_contact("study")
     if scene.effects.finite_strain is not None:
         raise SceneError(
             f"{path}: study compares methods of linear elasticity; set effects.finite_strain to false, or run reduce, "

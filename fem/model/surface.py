@@ -1,0 +1,56 @@
+"""The free boundary of the tissue: the nodes that obstacles can touch, the same on every rank."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import dolfinx.mesh
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from softgrasp.fem.model.assembly import Discretisation
+from softgrasp.fem.model.contact import contact_blocks
+from softgrasp.fem.petsc import Array, rows_on_all, total
+from softgrasp.fem.system import BlockSystem
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Nodes of the boundary that do not follow the hand, in the order of their numbers."""
+
+    comm: MPI.Intracomm  # ranks of the tissue
+    X: Array  # coordinates at rest, (p, d) [m]
+    T: Array  # rigid modes of the hand there, (p d, n_s) [1, m]
+    dofs: NDArray[np.intp]  # numbers among all tissue unknowns, (p d,)
+    mine: NDArray[np.intp]  # places here of the unknowns that this rank owns
+    rows: NDArray[np.intp]  # rows of those among the owned ones
+
+    def gather(self, x: Array) -> Array:
+        """Values (p d,) of a vector given by its owned rows. Collective."""
+        if self.comm.size == 1:
+            return x[self.rows]
+        part = np.zeros(len(self.dofs))
+        part[self.mine] = x[self.rows]
+        return total(self.comm, part)
+
+
+def make_surface(space: Discretisation, system: BlockSystem) -> Surface:
+    """The free boundary of a model. Collective."""
+    mesh, layout = space.V.mesh, system.layout
+    d = layout.dimension
+    mesh.topology.create_connectivity(d - 1, d)
+    outer, _ = contact_blocks(space.V, np.sort(dolfinx.mesh.exterior_facet_indices(mesh.topology)))
+    nodes = np.flatnonzero(np.isin(space.free, outer))
+    rows = (nodes[:, None] * d + np.arange(d)).ravel()
+    dofs = rows_on_all(layout.comm, layout.start + rows)
+    first = sum(layout.comm.allgather(len(rows))[: layout.comm.rank])
+    mine = np.arange(first, first + len(rows))
+    return Surface(
+        comm=layout.comm,
+        X=rows_on_all(layout.comm, layout.nodes[nodes]),
+        T=rows_on_all(layout.comm, system.T[rows]),
+        dofs=dofs,
+        mine=mine,
+        rows=rows,
+    )

@@ -1,0 +1,134 @@
+"""The contact problem of a step: 0 <= x, W x + q >= 0, x'(W x + q) = 0 with W = N S^-1 N' symmetric.
+
+Block principal pivoting [JP94] from the last set: rows of a wrong sign change sides all at once, and one by one where
+that stops to help. `small.c` keeps the factor of the set; without a compiler NumPy takes the same rounds.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.strain.compiled import library
+
+Array = NDArray[Any]
+SOURCE = Path(__file__).with_name("small.c")
+DECLARATION = """int softgrasp_complement(int p, int ld, const double *W, const double *q, double tol, int most,
+  int *count, int *order, double *L, double *x, int *side, double *room, long *tally);"""
+RIDGE = 1e-13  # share of the diagonal that makes equal rows share their force [1]; in `small.c` too
+RETRIES = 3  # rounds without progress before rows change sides one by one; in `small.c` too
+MOST = 40  # rounds for each row, at most: few problems take ten in all
+
+
+class SmallProblem:
+    """The problem with its last set; W may grow by rows between the calls.
+
+    Attributes:
+        order: rows of the set A in the order of the factor, the first ``count`` of them.
+        L: factor of W_AA in this order, (rows, rows).
+        rounds: since the start [1].
+        changes: rows that changed sides since the start [1].
+    """
+
+    def __init__(self, engine: str = "") -> None:
+        """``engine``: "C" or "NumPy"; empty takes C where there is a compiler. Raises SolverError: there is none."""
+        code = None if engine == "NumPy" else library(SOURCE, DECLARATION, "contact is solved in NumPy, more slowly")
+        if engine == "C" and code is None:
+            raise SolverError("compiled contact is not available here; leave the engine out")
+        self.code = code
+        self.count, self.order, self.L = np.zeros(1, np.intc), np.zeros(0, np.intc), np.zeros((0, 0))
+        self.tally = np.zeros(2, np.int64)
+
+    @property
+    def rounds(self) -> int:
+        """Rounds since the start [1]."""
+        return int(self.tally[0])
+
+    @property
+    def active(self) -> Array:
+        """Rows of the set, in the order of its factor."""
+        return self.order[: self.count[0]]
+
+    def _fit(self, size: int) -> None:
+        """Room for W of this size; the set stays."""
+        L, order, have = np.zeros((size, size)), np.zeros(size, np.intc), int(self.count[0])
+        L[:have, :have], order[:have] = self.L[:have, :have], self.order[:have]
+        self.L, self.order = L, order
+        self.x, self.side, self.room = np.zeros(size), np.zeros(size, np.intc), np.zeros(5 * size)
+
+    def restart(self, W: Array, active: Array) -> None:
+        """Begin from a set of another W, whose factor is made anew."""
+        self.count[0] = 0
+        self._fit(len(W))
+        rows = np.sort(active)
+        block = W[np.ix_(rows, rows)]
+        block[np.diag_indices(len(rows))] *= 1 + RIDGE
+        self.L[: len(rows), : len(rows)] = np.linalg.cholesky(block)
+        self.order[: len(rows)], self.count[0] = rows, len(rows)
+
+    def resume(self, order: Array, L: Array, tally: Array, size: int) -> None:
+        """Continue with a set and its factor, (m,) and (m, m), and the counts of the rounds."""
+        self._fit(size)
+        m = len(order)
+        self.order[:m], self.L[:m, :m], self.count[0], self.tally[:] = order, L.reshape(m, m), m, tally
+
+    def solve(self, p: int, W: Array, q: Array, tol: float) -> Array:
+        """X (p,) of the first p rows; W is contiguous and may have room for more.
+
+        ``tol``: by how much W x + q may be negative. Raises SolverError: the rounds do not end, which is so where
+        obstacles leave no room.
+        """
+        if len(W) != len(self.L):
+            self._fit(len(W))
+        failed = self._in_numpy(p, W, q, tol) if self.code is None else self._in_c(p, W, q, tol)
+        if failed:
+            raise SolverError(
+                f"the contact problem of {p} rows has no solution that {MOST * p} rounds find; obstacles that "
+                "leave the tissue no room are the usual reason: move one, or take smaller steps"
+            )
+        return self.x[:p]
+
+    def _in_c(self, p: int, W: Array, q: Array, tol: float) -> int:
+        assert self.code is not None
+        ffi, c = self.code
+
+        def at(x: Array, kind: str = "double[]") -> Any:
+            return ffi.from_buffer(kind, x)
+
+        result: int = c.softgrasp_complement(
+            p, len(W), at(W), at(q), tol, MOST * p, at(self.count, "int[]"), at(self.order, "int[]"), at(self.L),
+            at(self.x), at(self.side, "int[]"), at(self.room), at(self.tally, "long[]"),
+        )  # fmt: skip
+        return result
+
+    def _in_numpy(self, p: int, W: Array, q: Array, tol: float) -> int:
+        W, q = W[:p, :p], q[:p]
+        inside = np.zeros(p, dtype=bool)
+        inside[self.active] = True
+        best, tries = p + 1, RETRIES
+        for _ in range(MOST * p):
+            self.tally[0] += 1
+            rows, x = np.flatnonzero(inside), np.zeros(p)
+            block = W[np.ix_(rows, rows)]
+            block[np.diag_indices(len(rows))] *= 1 + RIDGE
+            x[rows] = np.linalg.solve(block, -q[rows])
+            wrong = np.where(inside, x < 0, q + W @ x < -tol)
+            count = int(wrong.sum())
+            if count == 0:
+                self.x[:p], self.count[0] = x, len(rows)
+                self.order[: len(rows)] = rows
+                return 0
+            if count < best:
+                best, tries = count, RETRIES
+            elif tries > 0:
+                tries -= 1
+            else:
+                wrong[: np.flatnonzero(wrong)[-1]] = False
+            self.tally[1] += int(wrong.sum())
+            inside ^= wrong
+        self.count[0] = 0
+        return -1

@@ -1,0 +1,387 @@
+"""Contact of the tissue with rigid obstacles, in the momentum form of the midpoint step.
+
+With the gap g_n of a boundary node, its normal N and what hand and obstacle add, dg, a step without contact ends at
+S w_0 = h + G c. Forces x with
+
+    0 <= x,  W x + q >= 0,  x'(W x + q) = 0,   W = N S^-1 N',  q = (g_n + dg) / 2 + N w_0
+
+leave no penetration at the end of the step: w = w_0 + S^-1 N'x, and r takes N'x twice, once before and once after the
+step, as it takes the load G c. Then nodes that are pressed stop: the inelastic impulse y with N v = 0 adds M^-1 N'y to
+v and s N'y to r. The work of x is x'(g_{n+1} - g_n - dg) = -x'(g_n + dg), the impulse takes its kinetic energy, and
+neither ever adds any at obstacles and a hand at rest.
+
+Where normals turn, the mean normal n of a step has n.(x_1 - x_0) = g_1 - g_0, so that the same holds; it is found by
+rounds on the small problem alone. A two-way hand feels N_s'x, N_s = N T.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softgrasp.fem.errors import SceneError, SolverError
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.contact import rigid_modes
+from softgrasp.fem.model.surface import make_surface
+from softgrasp.fem.obstacles import HalfSpace, make_obstacles
+from softgrasp.fem.obstacles.obstacle import mean_normal
+from softgrasp.fem.obstacles.responses import Responses
+from softgrasp.fem.obstacles.small import SmallProblem
+from softgrasp.fem.petsc import Array, rows_on_all, total
+from softgrasp.fem.run.contact_impulse import stopping_impulse
+from softgrasp.fem.run.contact_record import ContactRecord, Tables
+from softgrasp.fem.run.hand import HandStep
+from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
+from softgrasp.fem.run.motion import ForceDrive, TableDrive
+
+ROUNDING = 64 * float(np.finfo(float).eps)  # of a gap, over the coordinates it is computed from [1]
+STILL = 1e-12  # normal velocity of pressed nodes over the largest velocity on the boundary, which is rounding [1]
+MOST = 200  # rounds of a step
+STRAIGHT = 1e-8  # motion of a node over the size of the body below which its normal does not turn [1]
+Ints = NDArray[np.intp]
+Flags = NDArray[np.bool_]
+
+
+@dataclass
+class Rows:
+    """Contact rows of a step: a boundary node before an obstacle each, with its force."""
+
+    obstacle: Ints  # number of the obstacle, (k,)
+    node: Ints  # number of the boundary node, (k,)
+    normal: Array  # mean normal of the step, (k, d)
+    x: Array  # force [N], (k,)
+
+
+class Contact:
+    """Contact of one run. Making one is collective; its calls in a step as well where the tissue is distributed.
+
+    Args:
+        model: with ``effects.obstacles``.
+        midpoint: factored step of a direct solver, before its start: its vectors are used as scratch.
+        steps: of the run.
+        hand: equation of a two-way hand, or None for a hand that feels no tissue.
+
+    Raises SceneError: a path of an obstacle does not fit.
+    """
+
+    def __init__(self, model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> None:
+        system = model.system
+        self.system, self.midpoint, self.layout, self.hand = system, midpoint, system.layout, hand
+        self.dt, self.s = midpoint.dt, midpoint.s
+        self.obstacles = make_obstacles(model.scene, self.layout.dimension)
+        self.flat = all(isinstance(o.shape, HalfSpace) for o in self.obstacles)
+        self.surface = make_surface(model.space, system)
+        self.p, self.d = self.surface.X.shape
+        self.table = Tables.empty(steps, len(self.obstacles), self.d, self.layout.n_s)
+        self.whole, places = midpoint.operators.whole, self.surface.rows
+        if self.whole:
+            places = np.argsort(midpoint.operators.enter(np.arange(self.layout.n_e)))[self.surface.dofs]
+        self.places: Ints = places  # of the boundary's unknowns on the rows here
+        self.order: Any = slice(None) if self.whole else self.surface.mine  # which of them lie there
+        held = rows_on_all(self.layout.comm, self.layout.held)
+        self.held, self.held_T = held, rigid_modes(held, self.d, model.scene.effects.rotation, self.layout.reference)
+        self.small = SmallProblem()
+        self.z, self.moved, self.forces = (np.zeros(self.p * self.d) for _ in range(3))
+        self.gaps = self.after = np.zeros((len(self.obstacles), self.p))
+        self.rows = self._make_rows(np.zeros((0, 2), dtype=int))
+        # rows of W where all obstacles are flat, their responses, and whether a pair of obstacle and node has a row
+        self.pairs, self.columns, self.W = np.zeros((0, 2), dtype=int), list[int](), np.zeros((0, 0))
+        self.entered = np.zeros_like(self.gaps, dtype=bool)
+        self.fastest = 0.0  # largest velocity of a boundary node in a step with contact [m/s]
+        self.drive: TableDrive | ForceDrive | None = None
+        self.n = 0  # number of the step in work
+        self.responses = self._make_responses()
+
+    def _make_responses(self) -> Responses:
+        bases = [o.shape.normal[None] if isinstance(o.shape, HalfSpace) else np.eye(self.d) for o in self.obstacles]
+        directions = np.unique(np.vstack(bases), axis=0)
+        self.numbers = [[int(np.flatnonzero((directions == n).all(axis=1))[0]) for n in basis] for basis in bases]
+        self.b, self.y, reach = self.midpoint.r.duplicate(), self.midpoint.w.duplicate(), None
+        if self.hand is not None:
+            self.Y = np.column_stack([self._take(column) for column in self.midpoint.Y.T])
+            reach = self.surface.T - self.hand.theta * self.Y, self.hand.inverse / self.s**2
+        return Responses(directions, self._respond, self.p * self.d, reach)
+
+    def _respond(self, force: Array) -> tuple[Array, Array]:
+        """S^-1 of forces on the boundary. Collective."""
+        b = self.b.array_w
+        b[:] = 0.0
+        b[self.places] = force[self.order]
+        self.midpoint.solver.solve(self.b, self.y)
+        column = self.y.array_r
+        return column, self._take(column)
+
+    def _take(self, x: Array) -> Array:
+        """Values on the boundary of a vector on the rows here. Collective."""
+        return x[self.places] if self.whole else self.surface.gather(x)
+
+    def _at(self, z: Array, q: Array) -> Array:
+        """Places of the boundary nodes, (p, d) [m]."""
+        return self.surface.X + (z + self.surface.T @ q).reshape(self.p, self.d)
+
+    def _gaps(self, x: Array, n: int) -> Array:
+        return np.array([o.gap(x, n * self.dt) for o in self.obstacles])
+
+    def _tolerance(self, x: Array) -> float:
+        return ROUNDING * (float(np.abs(x).max(initial=0.0)) + self.layout.extent)
+
+    def _make_rows(self, pairs: Ints) -> Rows:
+        """Rows of pairs of obstacle and node, (k, 2), without force."""
+        k = len(pairs)
+        return Rows(pairs[:, 0], pairs[:, 1], np.zeros((k, self.d)), np.zeros(k))
+
+    # ---- the run
+
+    def start(self, state: TissueState, q: Array, n: int = 0) -> None:
+        """Look at the state at step n, with the hand at q. Collective.
+
+        Raises SceneError: an obstacle is in the tissue at the start.
+        """
+        self.z = np.array(self.surface.gather(state.z.array_r))
+        x = self._at(self.z, q)
+        self.gaps = self._gaps(x, n)
+        self.table.gap[n] = self.gaps.min(axis=1)
+        if n == 0 and self.gaps.min() < -self._tolerance(x):
+            o, i = np.unravel_index(self.gaps.argmin(), self.gaps.shape)
+            place = ", ".join(f"{c:.4g}" for c in x[i])
+            raise SceneError(
+                f"obstacle '{self.obstacles[o].name}' holds the node of the tissue at ({place}) m at the start, "
+                f"{-self.gaps[o, i]:.3g} m deep; move it, or start elsewhere"
+            )
+
+    def press(self, n: int, drive: TableDrive | ForceDrive) -> None:
+        """Turn the step without contact in the midpoint into one that leaves no penetration. Collective.
+
+        Raises SolverError: the rounds of the step do not end.
+        """
+        self.n, self.drive = n, drive
+        self.moved = self._take(self.midpoint.w_array)
+        x1 = self._at(self.z + 2 * self.moved, drive.q[n + 1])
+        self.after = self._gaps(x1, n + 1)
+        if self.after.min() >= 0:
+            self.rows = self._make_rows(np.zeros((0, 2), dtype=int))
+            return
+        f, self.rows = self._settle(n, self._at(self.z, drive.q[n]), x1)
+        self._add(n, f, drive)
+        rows, table = self.rows, self.table
+        np.add.at(table.force[n], rows.obstacle, rows.x[:, None] * rows.normal)
+        np.add.at(table.touching[n], rows.obstacle, 1)
+        table.hand[n] = self.surface.T.T @ self.forces
+        table.energy[:2] += 2 * self.forces @ self.moved, rows.x @ self.gaps[rows.obstacle, rows.node]
+
+    def _settle(self, n: int, x0: Array, free: Array) -> tuple[Array, Rows]:
+        """Forces of the step, by columns of the responses and by rows, from its free end. Collective."""
+        tol = self._tolerance(free)
+        known = self.after < 0
+        known[self.rows.obstacle, self.rows.node] = True
+        x1, active = free, known & False
+        active[self.rows.obstacle, self.rows.node] = True
+        for _ in range(MOST):
+            f, rows = self._flat_forces(known, tol) if self.flat else self._forces(known, active, n, x0, free, x1, tol)
+            x1 = free + self._correction(f)
+            after = self._gaps(x1, n + 1)
+            new = (after < -tol) & ~known
+            pressed = rows.x > 0
+            reached = np.abs(after[rows.obstacle, rows.node])[pressed].max(initial=0.0)
+            if not new.any() and reached <= tol:
+                self.after = after
+                return f, Rows(rows.obstacle[pressed], rows.node[pressed], rows.normal[pressed], rows.x[pressed])
+            known |= new
+            active[:] = False
+            active[rows.obstacle[pressed], rows.node[pressed]] = True
+        raise SolverError(
+            f"contact: {MOST} rounds leave a gap of {reached:.2g} m at pressed nodes; take more time.steps, or an "
+            "obstacle that is large against the cells"
+        )
+
+    def _correction(self, f: Array) -> Array:
+        """Motion of the boundary nodes over the step by forces f, (p, d) [m]."""
+        k = len(f)
+        z = 2 * (self.responses.surface[:, :k] @ f)
+        if self.hand is not None:
+            a = self.hand.inverse @ (self.responses.B[:k].T @ f)
+            z += self.surface.T @ (2 / self.s**2 * a) - 2 * self.hand.kappa * (self.Y @ a)
+        return z.reshape(self.p, self.d)
+
+    def _flat_forces(self, known: Flags, tol: float) -> tuple[Array, Rows]:
+        """Forces where all normals stay: W keeps the rows that it ever had, and the set its factor. Collective."""
+        self._enter(np.argwhere(known & ~self.entered))
+        k = len(self.columns)
+        rows = self._make_rows(self.pairs)
+        normals = [o.shape.normal for o in self.obstacles if isinstance(o.shape, HalfSpace)]
+        rows.normal = np.array(normals)[rows.obstacle]
+        rows.x = self.small.solve(k, self.W, self.after[rows.obstacle, rows.node] / 2, tol / 4).copy()
+        f = np.zeros(len(self.responses.keys))
+        np.add.at(f, self.columns, rows.x)
+        return f, rows
+
+    def _enter(self, pairs: Ints) -> None:
+        """Give pairs of flat obstacle and node, (k, 2), their rows in W. Collective."""
+        have = len(self.columns)
+        self.entered[pairs[:, 0], pairs[:, 1]] = True
+        self.pairs = np.vstack([self.pairs, pairs])
+        keys = [(int(i), self.numbers[o][0]) for o, i in pairs]
+        self.responses.enter(keys)
+        self.columns += [self.responses.where[key] for key in keys]
+        k = len(self.columns)
+        if k > len(self.W):
+            W = np.zeros((max(16, 2 * k),) * 2)
+            W[:have, :have] = self.W[:have, :have]
+            self.W = W
+        if k > have:
+            G = self.responses.G[np.ix_(self.columns, self.columns[have:])]
+            self.W[:k, have:k], self.W[have:k, :k] = G, G.T
+
+    def _forces(
+        self, known: Flags, active: Flags, n: int, x0: Array, free: Array, x1: Array, tol: float
+    ) -> tuple[Array, Rows]:
+        """Forces with the mean normals between x0 and x1. Collective."""
+        rows = self._make_rows(np.argwhere(known))
+        keys = [(int(i), number) for o, i in zip(rows.obstacle, rows.node, strict=True) for number in self.numbers[o]]
+        self.responses.enter(keys)
+        m = len(self.responses.keys)
+        C, q = np.zeros((len(rows.node), m)), self.after[rows.obstacle, rows.node] / 2
+        for o, obstacle in enumerate(self.obstacles):
+            mine = np.flatnonzero(rows.obstacle == o)
+            i = rows.node[mine]
+            if isinstance(obstacle.shape, HalfSpace):
+                rows.normal[mine] = obstacle.shape.normal
+                C[mine, [self.responses.where[int(j), self.numbers[o][0]] for j in i]] = 1.0
+                continue
+            begin, end = (x[i] - obstacle.shift(t * self.dt) for x, t in ((x0, n), (x1, n + 1)))
+            normal = mean_normal(obstacle.shape, begin, end, STRAIGHT * self.layout.extent)
+            rows.normal[mine] = normal
+            q[mine] = self.gaps[o, i] / 2
+            q[mine] += np.einsum("ij,ij->i", normal, free[i] - obstacle.shift((n + 1) * self.dt) - begin) / 2
+            for axis, number in enumerate(self.numbers[o]):
+                C[mine, [self.responses.where[int(j), number] for j in i]] = normal[:, axis]
+        W = C @ self.responses.G[:m, :m] @ C.T
+        self.small.restart(W, np.flatnonzero(active[rows.obstacle, rows.node]))
+        rows.x = self.small.solve(len(q), W, q, tol / 4).copy()
+        return C.T @ rows.x, rows
+
+    def _add(self, n: int, f: Array, drive: TableDrive | ForceDrive) -> None:
+        """Take forces f into the step of tissue and hand. Collective."""
+        midpoint, k = self.midpoint, len(f)
+        w, r = midpoint.w.array_w, midpoint.r.array_w  # PETSc sees that they change
+        w += self.responses.columns[:, :k] @ f
+        self.forces = self.responses.forces(f)
+        r[self.places] += self.forces[self.order]
+        if self.hand is not None:
+            a = self.hand.inverse @ (self.responses.B[:k].T @ f)
+            c = self.hand.kappa * a
+            w -= midpoint.Y @ c
+            r -= midpoint.G @ c
+            drive.c[n] -= c
+            midpoint.c = drive.c[n]
+            drive.v[n + 1] += self.dt * a
+            drive.q[n + 1] += self.dt**2 / 2 * a
+        self.moved = self._take(midpoint.w_array)
+
+    def finish(self, state: TissueState) -> None:
+        """Carry on what the step has left in the midpoint, and stop what is pressed. Collective."""
+        n = self.n
+        self.z += 2 * self.moved
+        self.gaps = self.after
+        self.table.gap[n + 1] = self.gaps.min(axis=1)
+        if len(self.rows.node):
+            self.midpoint.r.array_w[self.places] += self.forces[self.order]  # which r lacks once more, as it lacks G c
+            self._stop(state, n + 1)
+
+    def _stop(self, state: TissueState, n: int) -> None:
+        """The inelastic impulse on pressed nodes at the end of step n. Collective."""
+        drive, rows, d = self.drive, self.rows, self.d
+        assert drive is not None
+        v = (self.surface.gather(state.v.array_r) + self.surface.T @ drive.v[n]).reshape(self.p, d)[rows.node]
+        x = self._at(self.z, drive.q[n])[rows.node]
+        normal = np.zeros_like(x)
+        for o, obstacle in enumerate(self.obstacles):
+            mine = rows.obstacle == o
+            normal[mine] = obstacle.normal(x[mine], n * self.dt)
+            v[mine] -= obstacle.rate(n * self.dt)
+        self.fastest = max(self.fastest, float(np.abs(v).max()))
+        b = -np.einsum("ij,ij->i", normal, v)
+        if np.abs(b).max() <= STILL * self.fastest:
+            return
+        free = self.hand is not None
+        u, momentum, y = stopping_impulse(self.system, self.surface, rows.node, normal, b, free)
+        self._kick(state, n, u, momentum)
+        table, impulse = self.table, y[:, None] * normal
+        np.add.at(table.impulse[n - 1], rows.obstacle, impulse)
+        table.force[n - 1] += table.impulse[n - 1] / self.dt
+        forces = np.zeros((self.p, d))
+        np.add.at(forces, rows.node, impulse)
+        table.hand[n - 1] += self.surface.T.T @ forces.ravel() / self.dt
+
+    def _kick(self, state: TissueState, n: int, u: Array, momentum: Array) -> None:
+        """Add a jump u of the velocity to tissue and hand. Collective."""
+        comm, rows = self.layout.comm, self.layout.n_local
+        G, drive, table = self.system.G, self.drive, self.table
+        assert drive is not None
+        jump, hand = u[:rows], u[rows:]
+        gained = momentum[:rows] - (G @ hand if len(hand) else 0.0)  # M u of the tissue, which its momentum takes up
+        mean = state.v.array_r + jump / 2
+        state.v.array_w[:] += jump
+        self.midpoint.r.array_w[:] += self.s * self.midpoint.operators.gather(gained)
+        if len(hand):
+            drive.v[n] += hand
+        sums = total(comm, np.concatenate([G.T @ jump, [mean @ gained, momentum[:rows] @ jump / 2]]))
+        table.kick[n - 1] = sums[:-2]
+        table.energy[0] += sums[-2]
+        table.energy[2] += sums[-1] + momentum[rows:] @ hand / 2
+
+    # ---- what is left of a run
+
+    def check_hand(self, drive: TableDrive | ForceDrive, begin: int, end: int) -> None:
+        """See that the nodes that follow the hand are in no obstacle at the steps from begin to before end.
+
+        Raises SolverError: they did; the message names obstacle and time.
+        """
+        for n in range(begin, end):
+            x = self.held + (self.held_T @ drive.q[n]).reshape(self.held.shape)
+            for obstacle in self.obstacles:
+                gap = obstacle.gap(x, n * self.dt).min(initial=0.0)
+                if gap < -self._tolerance(x):
+                    raise SolverError(
+                        f"the hand meets obstacle '{obstacle.name}' at t = {n * self.dt:.6g} s: the nodes that it "
+                        f"holds are rigid and {-gap:.2g} m deep in it; change the motion, the obstacle or [contact]"
+                    )
+
+    def record(self) -> ContactRecord:
+        """The record of the run."""
+        table = self.table
+        work, touch, stopped = table.energy.tolist()
+        names = tuple(o.name for o in self.obstacles)
+        return ContactRecord(
+            names, table.force, table.impulse, table.gap, table.touching, work, touch, stopped, self.small.rounds,
+            len(self.responses.keys), self.p,
+        )  # fmt: skip
+
+    def restart_arrays(self) -> dict[str, Array]:
+        """Record and sets of a restart file, see :class:`softgrasp.fem.run.checkpoint.RestartState`."""
+        small, m = self.small, len(self.small.active)
+        parts: list[NDArray[Any]] = [
+            self.table.energy, np.array([self.fastest]), small.tally, np.array(self.responses.keys).ravel(),
+            self.pairs.ravel(), np.array([self.rows.obstacle, self.rows.node]).ravel(), small.active,
+            small.L[:m, :m].ravel(),
+        ]  # fmt: skip
+        sizes = np.array([len(part) for part in parts])
+        return {"solver_rows": self.table.packed(self.n + 1), "solver_numbers": np.concatenate([sizes, *parts])}
+
+    def restore(self, rows: Array, numbers: Array) -> None:
+        """Continue with what `restart_arrays` returned. Collective."""
+        self.table.unpack(rows)
+        parts = np.split(numbers[8:], np.cumsum(numbers[:7].astype(int)))
+        self.table.energy[:], self.fastest = parts[0], float(parts[1][0])
+        self.responses.enter([(int(i), int(k)) for i, k in parts[3].reshape(-1, 2)])
+        self._enter(parts[4].reshape(-1, 2).astype(int))
+        self.rows = self._make_rows(parts[5].reshape(2, -1).T.astype(int))
+        self.small.resume(parts[6].astype(int), parts[7], parts[2].astype(int), len(self.W))
+
+    def destroy(self) -> None:
+        """Free all PETSc objects. Collective."""
+        self.b.destroy()
+        self.y.destroy()

@@ -1,0 +1,51 @@
+"""The impulse that stops pressed nodes, on the mass matrix of tissue and hand."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+
+from softgrasp.fem.model.surface import Surface
+from softgrasp.fem.obstacles.impulse import stop
+from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.system import BlockSystem
+
+
+def stopping_impulse(
+    system: BlockSystem, surface: Surface, nodes: NDArray[np.intp], normal: Array, b: Array, free: bool
+) -> tuple[Array, Array, Array]:
+    """Jump u of the velocity with N u = b and least energy, M u, and the impulses y of the rows, M u = N'y. Collective.
+
+    The owned rows of the tissue come first, then the hand where it is ``free`` and feels the tissue; there M has G and
+    M_hand + M_rigid as well, and N has N_s = N T.
+    """
+    comm, n, (p, d) = system.layout.comm, system.layout.n_local, surface.X.shape
+    columns, k = (nodes[:, None] * d + np.arange(d)).ravel(), len(b)
+    N = csr_matrix((normal.ravel(), columns, np.arange(k + 1) * d), shape=(k, p * d))
+    M_s, N_s = (system.M_hand + system.M_rigid, N @ surface.T) if free else (np.zeros((0, 0)), np.zeros((k, 0)))
+    G = system.G if free else np.zeros((n, 0))
+    at, of = system.M_ee.createVecs()
+    system.M_ee.getDiagonal(at)
+    diagonal = np.concatenate([at.array_r, np.diag(M_s)])
+
+    def multiply(u: Array) -> Array:
+        at.array_w[:] = u[:n]
+        system.M_ee.mult(at, of)
+        return np.concatenate([of.array_r + G @ u[n:], total(comm, G.T @ u[:n]) + M_s @ u[n:]])
+
+    def transpose(y: Array) -> Array:
+        result = np.zeros(n + len(M_s))
+        result[surface.rows] = (N.T @ y)[surface.mine]
+        result[n:] = N_s.T @ y
+        return result
+
+    def dot(a: Array, b: Array) -> float:
+        return float(total(comm, np.array([a[:n] @ b[:n]]))[0] + a[n:] @ b[n:])
+
+    small = (N.multiply(1 / surface.gather(diagonal)) @ N.T).toarray() + N_s / diagonal[n:] @ N_s.T
+    try:
+        return stop(multiply, diagonal, dot, lambda u: N @ surface.gather(u) + N_s @ u[n:], transpose, small, b)
+    finally:
+        at.destroy()
+        of.destroy()

@@ -1,0 +1,80 @@
+"""What obstacles did to the tissue in a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softgrasp.fem.petsc import Array
+
+
+@dataclass(frozen=True)
+class ContactRecord:
+    """Forces, gaps and energies of contact in a run; arrays are the same on every rank."""
+
+    names: tuple[str, ...]
+    """Names of the obstacles."""
+    force: Array
+    """Mean force of each obstacle on the tissue in each step, impulses included, (steps, obstacles, d) [N]."""
+    impulse: Array
+    """Impulse of each obstacle on the tissue at the end of each step, (steps, obstacles, d) [N s]."""
+    gap: Array
+    """Least gap between boundary nodes and each obstacle, (steps + 1, obstacles) [m]."""
+    touching: NDArray[Any]
+    """Number of boundary nodes that each obstacle presses in each step, (steps, obstacles)."""
+    work: float
+    """Work of the contact on the tissue in the frame of the hand, impulses included [J]."""
+    touch: float
+    """Energy that the steps of first touch took, >= 0 [J]."""
+    stopped: float
+    """Kinetic energy that the impulses took, >= 0 [J]."""
+    rounds: int
+    """Rounds of all contact problems [1]."""
+    columns: int
+    """Responses of the tissue to boundary forces that were solved for [1]."""
+    nodes: int
+    """Boundary nodes that may touch [1]."""
+
+    @property
+    def penetration(self) -> float:
+        """Largest depth of a boundary node at the end of a step [m]."""
+        return max(0.0, -float(self.gap.min(initial=0.0)))
+
+
+@dataclass
+class Tables:
+    """The record of a run in progress."""
+
+    force: Array  # mean forces, (steps, obstacles, d) [N]
+    impulse: Array  # impulses, (steps, obstacles, d) [N s]
+    gap: Array  # least gaps, (steps + 1, obstacles) [m]
+    touching: Array  # numbers of pressed nodes, (steps, obstacles)
+    hand: Array  # force of the contact in the freedoms of the hand, impulses included, (steps, n_s) [N, N m]
+    kick: Array  # G'u for the jump u of the velocity by each impulse, (steps, n_s) [N s, N m s]
+    energy: Array  # work, and energy taken at first touch and by impulses, (3,) [J]
+
+    @staticmethod
+    def empty(steps: int, obstacles: int, d: int, n_s: int) -> Tables:
+        """Room for all steps."""
+        force, impulse = np.zeros((2, steps, obstacles, d))
+        hand, kick = np.zeros((2, steps, n_s))
+        return Tables(
+            force, impulse, np.zeros((steps + 1, obstacles)), np.zeros((steps, obstacles)), hand, kick, np.zeros(3)
+        )
+
+    def _tables(self) -> tuple[Array, ...]:
+        return self.force, self.impulse, self.gap, self.touching, self.hand, self.kick
+
+    def packed(self, n: int) -> Array:
+        """The first n rows of all tables side by side, (n, numbers)."""
+        return np.hstack([table[:n].reshape(n, -1) for table in self._tables()])
+
+    def unpack(self, rows: Array) -> None:
+        """Take back what `packed` returned."""
+        n, tables = len(rows), self._tables()
+        parts = np.split(rows, np.cumsum([table[0].size for table in tables])[:-1], axis=1)
+        for table, part in zip(tables, parts, strict=True):
+            table[:n] = part.reshape(n, *table.shape[1:])
