@@ -18,8 +18,9 @@ import softgrasp
 from softgrasp.fem.scene.scene import scene_schema
 
 ROOT = Path(__file__).parents[1]
-ROOMS = {"fem": "Scene, model, run", "reduction": "Reduced models", "lqr": "Control"}
+ROOMS = {"fem": "Scene, model, run", "reduction": "Reduced models", "lqr": "Control", "study": "Many runs"}
 MORE = {
+    "study": ["study.runs.sweep.SweepTable", "study.notebook.Film"],
     "fem": ["fem.fields.series.SeriesWriter"],
     "reduction": ["reduction.model.ReducedModel", "reduction.model.ReducedSystem", "reduction.lti.LTI"],
     "lqr": ["lqr.loop.margins.loop_margins", "lqr.loop.margins.LoopMargins"],

@@ -124,8 +124,8 @@ def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, ...]
         return style.save(figure, out_png)
 
 
-def figure_bode(margins: LoopMargins, out_png: Path) -> tuple[Path, ...]:
-    """Gain and phase of the loop at each input, with the crossover of its phase margin."""
+def bode(margins: LoopMargins) -> Any:
+    """Gain and phase of the loop at each input, with the crossover of its phase margin; a Matplotlib figure."""
     with style.paper_style():
         figure, (gain, phase) = plt.subplots(
             2, 1, figsize=(style.WIDTH, 0.6 * style.WIDTH), sharex=True, layout="constrained"
@@ -148,7 +148,7 @@ def figure_bode(margins: LoopMargins, out_png: Path) -> tuple[Path, ...]:
         gain.set_ylabel("gain of the loop [1]")
         phase.set(xlabel="frequency [rad/s]", ylabel="phase [deg]")
         gain.legend()
-        return style.save(figure, out_png)
+        return figure
 
 
 def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Frames) -> list[Path]:
@@ -163,7 +163,7 @@ def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Fr
     if any(b.reports for b in study.bases):
         files += figure_gains(study.bases, out / "errors.png")
     if study.margins is not None:
-        files += figure_bode(study.margins, out / "bode.png")
+        files += style.save(bode(study.margins), out / "bode.png")
     # rounding of the eigenvalues of the lowest modes
     noise = 1e-13 * max(float(np.abs(p).max(initial=0.0)) for p in poles.values())
     files += figure_decay(poles, out / "decay.png", noise=noise)

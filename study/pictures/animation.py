@@ -31,14 +31,19 @@ REST = 1.0  # [s] the last frame stays longer
 def gif_move(
     picture: PictureMesh, frames: Array, times: Array, table: Array, target: npt.ArrayLike | None, out_gif: Path
 ) -> Path:
-    """Body, hand, path and target in motion, in real time from 0.3 to 30 s; at most 60 frames and 3 MB.
+    """:func:`move_bytes` as a file, whose name is returned."""
+    return write_gif(move_bytes(picture, frames, times, table, target), out_gif)
+
+
+def move_bytes(picture: PictureMesh, frames: Array, times: Array, table: Array, target: npt.ArrayLike | None) -> bytes:
+    """A GIF of body, hand, path and target in motion, in real time from 0.3 to 30 s; at most 60 frames and 3 MB.
 
     Too many frames are thinned out; for the arguments see :func:`softgrasp.study.pictures.body.figure_move`.
     """
     kept, durations = timing(times)
     frames, times = frames[kept].astype(np.float64), times[kept]
     shot = make_shot(picture, frames, times, table, target)
-    return write_gif(_render(shot, frames, times), durations, out_gif)
+    return gif_bytes(_render(shot, frames, times), durations)
 
 
 def timing(times: Array) -> tuple[list[int], list[int]]:
@@ -104,8 +109,15 @@ def film(
     return images
 
 
-def write_gif(images: list[Any], durations: list[int], out_gif: Path) -> Path:
-    """Write frames of one size, each with its duration [ms], smaller if they would take more than 3 MB."""
+def write_gif(gif: bytes, out_gif: Path) -> Path:
+    """Write an animated picture and return its path."""
+    note(out_gif)
+    out_gif.write_bytes(gif)
+    return out_gif
+
+
+def gif_bytes(images: list[Any], durations: list[int]) -> bytes:
+    """A GIF of frames of one size, each with its duration [ms], smaller if they would take more than 3 MB."""
     palette = _palette()
     for scale in (1.0, 0.8, 0.6, 0.45):
         size = tuple(round(scale * n) for n in images[0].size)
@@ -115,9 +127,7 @@ def write_gif(images: list[Any], durations: list[int], out_gif: Path) -> Path:
         first.save(buffer, format="GIF", save_all=True, append_images=rest, duration=durations, loop=0, optimize=False)
         if buffer.tell() <= MOST_BYTES:
             break
-    note(out_gif)
-    out_gif.write_bytes(buffer.getvalue())
-    return out_gif
+    return buffer.getvalue()
 
 
 def _palette() -> Any:

@@ -49,21 +49,31 @@ def figure_histories(
     inputs: Array,
     columns: Columns,
     out_png: Path,
+    **options: Any,
+) -> tuple[Path, ...]:
+    """:func:`histories` with its options as PNG and PDF, whose names are returned."""
+    return save(histories(times, outputs, inputs, columns, **options), out_png)
+
+
+def histories(
+    times: Array,
+    outputs: Array,
+    inputs: Array,
+    columns: Columns,
     *,
     target: npt.ArrayLike | None = None,
     limits: npt.ArrayLike | None = None,
     others: Mapping[str, tuple[Array, Array]] | None = None,
     settle: float | None = None,
     dimension: int | None = None,
-) -> tuple[Path, ...]:
-    """Outputs, their distance to the target, and inputs against time; PNG and PDF, whose names are returned.
+) -> Any:
+    """Outputs, their distance to the target, and inputs against time; a Matplotlib figure.
 
     Args:
         times: grid, shape (m + 1,) [s].
         outputs: shape (m + 1, p) [m, rad]; rotations get axes of their own.
         inputs: constant in each step, shape (m, n_s) [N, N m].
         columns: one per output.
-        out_png: name of the picture; the PDF gets its stem.
         target: outputs aimed at, shape (p,).
         limits: bounds on the inputs, shape (n_s,); drawn when finite.
         others: outputs and inputs of other runs on the same grid by name, drawn thin.
@@ -105,7 +115,7 @@ def figure_histories(
             axes[-1].legend(
                 handles=entries, **(BESIDE if aim is not None else {**BESIDE, "bbox_to_anchor": (1.0, 0.5)})
             )
-        return save(figure, out_png)
+        return figure
 
 
 def _output_panels(runs: Runs, columns: Columns, aim: Array | None) -> list[_Panel]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,8 +18,10 @@ from PIL import Image
 from softgrasp.fem.owned import note
 from softgrasp.study.pictures import PDF
 
-mpl.use("Agg")
+if "inline" not in os.environ.get("MPLBACKEND", ""):  # a notebook shows figures by its own
+    mpl.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullFormatter
 
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # Okabe and Ito
@@ -147,11 +150,13 @@ def save(figure: Any, out_png: Path) -> tuple[Path, ...]:
     for ax in figure.axes:
         for axis in (ax.xaxis, ax.yaxis):
             _plain_powers(axis)
-    fit(figure, MARGIN)  # Matplotlib's own bbox_inches="tight" lays out and draws twice
-    figure.canvas.draw()
-    Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3]).save(out_png, dpi=(DPI, DPI))
-    for file in files[1:]:
-        figure.savefig(file)
+    canvas = FigureCanvasAgg(figure)
+    with paper_style():
+        fit(figure, MARGIN)  # Matplotlib's own bbox_inches="tight" lays out and draws twice
+        canvas.draw()
+        Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).save(out_png, dpi=(DPI, DPI))
+        for file in files[1:]:
+            figure.savefig(file)
     plt.close(figure)
     return files
 

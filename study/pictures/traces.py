@@ -23,7 +23,20 @@ def figure_traces(
     rigid: Array | None = None,
     dimension: int | None = None,
 ) -> tuple[Path, ...]:
-    """Hand and outputs against time, and below what the outputs move relative to the hand; PNG and PDF.
+    """:func:`traces` as PNG and PDF, whose names are returned."""
+    return save(traces(times, outputs, columns, q_s, rigid=rigid, dimension=dimension), out_png)
+
+
+def traces(
+    times: Array,
+    outputs: Array,
+    columns: Columns,
+    q_s: Array,
+    *,
+    rigid: Array | None = None,
+    dimension: int | None = None,
+) -> Any:
+    """Hand and outputs against time, and below what the outputs move relative to the hand; a Matplotlib figure.
 
     An output that is the hand again is drawn once, as the hand, and has no share in what moves relative to it.
 
@@ -74,7 +87,7 @@ def figure_traces(
         axes[-1].set_xlabel("time [s]")
         axes[-1].set_xlim(float(times[0]), float(times[-1]))
         figure.align_ylabels(axes)
-        return save(figure, out_png)
+        return figure
 
 
 def _not_the_hand(outputs: Array, columns: Columns, axes_of: list[int], q_s: Array, d: int) -> list[int]:

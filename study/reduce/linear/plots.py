@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from softgrasp.reduction.bases.registry import PAPER_METHODS
 from softgrasp.study.pictures import style
-from softgrasp.study.pictures.animation import film, timing, write_gif
+from softgrasp.study.pictures.animation import film, gif_bytes, timing, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, outline
 from softgrasp.study.pictures.shapes import hands_at
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, by_error, unbeaten
@@ -288,4 +288,4 @@ def gif_compare(views: Views, out_gif: Path) -> Path:
     with style.paper_style():
         figure, axes, shot = _figure(views)
         images = film(figure, axes, partial(_draw, axes, shot, views), kept)
-    return write_gif(images, durations, out_gif)
+    return write_gif(gif_bytes(images, durations), out_gif)
