@@ -20,8 +20,9 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.model import ModelError, Outputs, ReducedModel
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.operators import Reconstruction
+from softgrasp.reduction.system import ModelError, Outputs
 
 if TYPE_CHECKING:
     from softgrasp.reduction.strain.model import StrainModel

@@ -154,7 +154,7 @@ def test_every_command_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         warned = json.loads((page.parent / "result.json").read_text()).get("warnings")
         assert not warned or ">Warnings</h2>" in text, page
     controller = sg.Controller.load("out/strip-control/controller.npz")
-    assert controller.plant.lti().under(controller.K).to_control().poles().real.max() < 0
+    assert controller.plant.under(controller.K).to_control().poles().real.max() < 0
     assert (tmp_path / "out/answer/report.html").exists()
 
 

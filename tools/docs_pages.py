@@ -22,7 +22,7 @@ ROOMS = {"fem": "Scene, model, run", "reduction": "Reduced models", "lqr": "Cont
 MORE = {
     "study": ["study.runs.sweep.SweepTable", "study.notebook.Film"],
     "fem": ["fem.fields.series.SeriesWriter"],
-    "reduction": ["reduction.model.ReducedModel", "reduction.model.ReducedSystem", "reduction.lti.LTI"],
+    "reduction": ["reduction.model.ReducedModel", "reduction.system.EnergySystem", "fem.reduced.ReducedSystem"],
     "lqr": ["lqr.loop.margins.loop_margins", "lqr.loop.margins.LoopMargins"],
 }
 
