@@ -150,7 +150,7 @@ def save(figure: Any, out_png: Path) -> tuple[Path, ...]:
     for ax in figure.axes:
         for axis in (ax.xaxis, ax.yaxis):
             _plain_powers(axis)
-    canvas = FigureCanvasAgg(figure)
+    canvas: Any = FigureCanvasAgg(figure)
     with paper_style():
         fit(figure, MARGIN)  # Matplotlib's own bbox_inches="tight" lays out and draws twice
         canvas.draw()
