@@ -134,7 +134,7 @@ class GainBounds:
         inputs, one = np.linalg.solve(self.problem.R, B.T), np.eye(len(A))
         pairs = [[np.outer(e, b) / 2 for e in one] for b in inputs]
         L = np.array([[lyapunov(T, U, W + W.T) for W in row] for row in pairs])
-        return np.einsum("ijab,jc->icab", L, np.linalg.inv(S))
+        return np.asarray(np.einsum("ijab,jc->icab", L, np.linalg.inv(S)))
 
     def _worst(self, errors: Array) -> float:
         return max(
