@@ -16,6 +16,7 @@ from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError, SolverError
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.run.checkpoint import check_ranks
+from softgrasp.fem.run.forecast import forecasts, told
 from softgrasp.fem.run.simulate import FRAMES, LIGHT, Run, RunOptions, frame_count, simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estimate_error
@@ -59,6 +60,9 @@ def run_simulate(
         check_ranks(session.comm, out / "checkpoint")
     model = session.model(scene)
     model.system.release()
+    expected = forecasts(model)
+    if expected:
+        console.print(told(expected), soft_wrap=True)
     scene, frames, n_e = model.scene, Frames(model, out, session.pictures), model.system.layout.n_e
     if few := _few_fields(scene, n_e):
         console.print(few, soft_wrap=True)
