@@ -60,12 +60,9 @@ def run_simulate(
         check_ranks(session.comm, out / "checkpoint")
     model = session.model(scene)
     model.system.release()
-    expected = forecasts(model)
-    if expected:
-        console.print(told(expected), soft_wrap=True)
     scene, frames, n_e = model.scene, Frames(model, out, session.pictures), model.system.layout.n_e
-    if few := _few_fields(scene, n_e):
-        console.print(few, soft_wrap=True)
+    for text in filter(None, (told(forecasts(model)), _few_fields(scene, n_e))):
+        console.print(text, soft_wrap=True)
 
     def join(run: Run) -> None:
         frames.begin(run)

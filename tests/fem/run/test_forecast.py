@@ -10,7 +10,6 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.forecast import RANKS, START, forecast, forecasts, told
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.study.report.origin import peak_memory_mb
 from tests.helpers.models import make_scene
 
 BLOCK = ["tissue.refine=false", "tissue.order=2", "tissue.cells=[8, 6, 16]", "output.fields=none"]
@@ -58,4 +57,3 @@ def test_a_run_takes_what_is_told(solver: str) -> None:
     simulate(model)
     spent, expected = time.process_time() - begin, forecasts(model)[0]
     assert (expected.seconds - START) / 3 < spent < 3 * (expected.seconds - START)
-    assert expected.memory / 2 < 2**20 * peak_memory_mb(MPI.COMM_SELF)
