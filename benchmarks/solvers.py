@@ -70,7 +70,7 @@ def measure(kind: str, order: int, model: Model) -> Iterator[Row]:
         solve = statistics.median(cpu_seconds(lambda: solver.solve(r, w)) for _ in range(REPEATS))  # noqa: B023
         count, modelled = 0, work.solve(name)
         if name in ITERATIVE:
-            count, modelled = int(solver.ksp.getIterationNumber()), modelled / GUESSED[False]
+            count, modelled = int(solver.ksp.getIterationNumber()), modelled / GUESSED[name]
         solver.destroy()
         yield Row(kind, layout.n_e, name, count, setup, solve, setup / work.setup(name), solve / modelled)
 

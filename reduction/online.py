@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from softgrasp.fem.columns import TURNS
+from softgrasp.fem.labelled import Labelled, Quantity, of_hand
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.model import ModelError, ReducedSystem, UnstableModelError
-from softgrasp.reduction.propagator import Propagator, march, march_together, propagator
+from softgrasp.fem.reduced import march_together
+from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
+from softgrasp.reduction.propagator import Propagator, propagator
+from softgrasp.reduction.system import EnergySystem, ModelError, UnstableModelError
 
 # byte of the matrices of a batch up to which all models step together; somewhere between 4 and 11 MB they leave the
 # cache, and one model after the other is faster (docs/benchmarks.md)
 TOGETHER = 5_000_000
 
 
-@dataclass(frozen=True)
-class ReducedTrajectory:
+@dataclass(frozen=True, repr=False)
+class ReducedTrajectory(Shown, Labelled):
     """What a reduced run returns."""
 
     times: Array  # (steps + 1,) [s]
@@ -26,6 +31,29 @@ class ReducedTrajectory:
     v_s: Array  # velocity of the hand, (steps + 1, n_s) [m/s, rad/s]
     outputs: Array  # y, (steps + 1, p) [m]
     output_names: tuple[str, ...]  # one per component
+
+    def card(self) -> Card:
+        """Steps, dimension and outputs."""
+        rows = (
+            ("time", f"{counted(len(self.times) - 1, 'step')} to {amount(self.times[-1], 's')}"),
+            ("dimension", f"N = {self.x.shape[1]}"),
+            ("outputs", listed(self.output_names)),
+        )
+        return Card("Trajectory of a reduced model", rows)
+
+    def plot(self) -> Any:
+        """Hand and outputs over time, as ``matplotlib`` figure."""
+        return drawn("reduced", self)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Outputs and hand over time with their labels and units."""
+        units = tuple("rad" if name.rsplit("_", 1)[-1] in TURNS else "m" for name in self.output_names)
+        return {
+            "outputs": Quantity(self.outputs, self.output_names, units, "output"),
+            "q_s": of_hand(self.q_s, self.output_names),
+            "v_s": of_hand(self.v_s, self.output_names, rate="/s"),
+        }
 
 
 def _check_stable(step: Propagator, allow_unstable: bool) -> None:
@@ -38,7 +66,7 @@ def _check_stable(step: Propagator, allow_unstable: bool) -> None:
 
 
 def run(
-    model: ReducedSystem | Propagator,
+    model: EnergySystem | Propagator,
     dt: float | None = None,
     force: Array | None = None,
     hand: tuple[Array, Array] | None = None,
@@ -70,13 +98,13 @@ def run(
     if hand is None and (inputs.ndim != 2 or inputs.shape[1] != model.n_s or len(inputs) < 1):
         raise ModelError(f"the force has the shape {inputs.shape}; it must be (steps, {model.n_s})")
     start = np.zeros(model.N) if x0 is None else np.asarray(x0, dtype=float)
-    w = march(step, inputs, step.at.X_inverse @ start[model.N - step.size :])
+    w = step.march(inputs, step.at.X_inverse @ start[model.N - step.size :])
     return trajectory(step, w, hand)
 
 
-def prepared(model: ReducedSystem | Propagator, dt: float | None, driven: bool) -> Propagator:
+def prepared(model: EnergySystem | Propagator, dt: float | None, driven: bool) -> Propagator:
     """A propagator for the kind of input; checks one that was made beforehand."""
-    if isinstance(model, ReducedSystem):
+    if isinstance(model, EnergySystem):
         if dt is None:
             raise ModelError("give the time step dt [s]")
         return propagator(model, dt, driven)
@@ -101,7 +129,7 @@ def checked_hand(hand: tuple[Array, Array], n_s: int) -> tuple[Array, Array]:
     return q, v
 
 
-def hand_inputs(model: ReducedSystem, hand: tuple[Array, Array], dt: float) -> Array:
+def hand_inputs(model: EnergySystem, hand: tuple[Array, Array], dt: float) -> Array:
     """Mean position, velocity and acceleration of each step from tables (steps + 1, n_s); (steps, 3 n_s)."""
     q, v = checked_hand(hand, model.n_s)
     q = consistent(q, v, dt)
@@ -110,14 +138,15 @@ def hand_inputs(model: ReducedSystem, hand: tuple[Array, Array], dt: float) -> A
 
 def trajectory(step: Propagator, w: Array, hand: tuple[Array, Array] | None) -> ReducedTrajectory:
     """Bundle states w (steps + 1, k) with the hand, prescribed or of the states, and the outputs."""
-    model, op, x = step.model, step.model.operators, w @ step.at.X.T
+    model, x = step.model, w @ step.at.X.T
     if hand is None:
-        q, v = x @ op.S_q.T, x @ op.S_v.T
+        q, v = x @ model.S_q.T, x @ model.S_v.T
+        y = x @ model.C.T
     else:
         q, v = hand
         x = np.hstack([consistent(q, v, step.dt), v, x])
-    y = x @ model.outputs.C_z.T + q @ model.outputs.C_s.T
-    return ReducedTrajectory(step.dt * np.arange(float(len(x))), x, q, v, y, model.outputs.names)
+        y = x @ model.C.T + (q - x[:, : model.n_s]) @ model.C_s.T
+    return ReducedTrajectory(step.dt * np.arange(float(len(x))), x, q, v, y, model.names)
 
 
 class Stepper:
@@ -130,7 +159,7 @@ class Stepper:
 
     def __init__(
         self,
-        model: ReducedSystem | Propagator,
+        model: EnergySystem | Propagator,
         dt: float | None = None,
         x0: Array | None = None,
         allow_unstable: bool = False,
@@ -138,8 +167,7 @@ class Stepper:
         self.step = prepared(model, dt, False)
         _check_stable(self.step, allow_unstable)
         model = self.step.model
-        k, op = self.step.size, model.operators
-        C = model.outputs.C_z + model.outputs.C_s @ op.S_q
+        k, C = self.step.size, model.C
         # new state, and outputs of the new state, in one product
         self._matrix = np.ascontiguousarray(np.vstack([self.step.matrix, C @ self.step.at.X @ self.step.matrix]))
         self._row = np.zeros(self._matrix.shape[1])
@@ -166,7 +194,7 @@ class Stepper:
 
 
 def run_batch(
-    models: Sequence[ReducedSystem | Propagator],
+    models: Sequence[EnergySystem | Propagator],
     dt: float,
     forces: Array | None = None,
     allow_unstable: bool = False,
@@ -210,7 +238,7 @@ def run_batch(
     many = len(steps) > 1
     rest, alone = np.zeros(steps[0].size), all(s.modal is not None for s in steps)
     if many and (alone or sum(s.block.nbytes for s in steps) > TOGETHER):
-        states: Iterable[Array] = (march(s, inputs, rest) for s, inputs in zip(steps, u, strict=True))
+        states: Iterable[Array] = (s.march(inputs, rest) for s, inputs in zip(steps, u, strict=True))
     else:
         states = march_together(steps, u, rest)
     return [trajectory(steps[i if many else 0], w, own[i]) for i, w in enumerate(states)]

@@ -15,18 +15,16 @@ so that c_n = e^{i a n} (c_0 + sum_m e^{-i a m} ...): a whole run is a sum, with
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.model import ModelError, ReducedSystem
+from softgrasp.fem.reduced import MidpointSteps
 from softgrasp.reduction.spectrum import NULL_TOLERANCE, balanced, energy_factor, is_skew, skew_modes
+from softgrasp.reduction.system import EnergySystem, ModelError
 
-STEPS = 8  # in one product: more would not gain at N = 30, where a product costs as much as the call
-BLOCK_ENTRIES = 32_768  # of the matrix of several steps: 256 kB stay in a core's own cache
 SLOW = 0.01  # sine or cosine below which one unit in the last place of the other turns by 1e-12 of the angle
 TURNS = 32  # angles whose sine and cosine are computed; the others are products of two of them
 
@@ -134,82 +132,43 @@ def modal_of(at: StepCoordinates, E: Array, A: Array, loads: Array, dt: float) -
 
 
 @dataclass(frozen=True)
-class Propagator:
-    """One step in energy coordinates, w_{n+1} = matrix [w_n; u_n; 1], and b of them at once.
+class Propagator(MidpointSteps):
+    """Steps of a reduced model in energy coordinates x = X w; the matrices E and A have the columns of X.
 
-    A conservative model also has ``modal``, which runs without either; they are then made when they are first used.
+    A conservative model also has ``modal``, which runs without a matrix of the steps.
     """
 
-    model: ReducedSystem  # what it steps
-    dt: float  # step [s]
+    model: EnergySystem  # what it steps
     at: StepCoordinates  # coordinates, x = X w
-    E: Array  # E of the stepped equations, all of the model or those of its tissue, (n, n)
-    A: Array  # A of the stepped equations, (n, n)
-    loads: Array  # [input of u, constant load], (N or the tissue's own coordinates, m + 1)
     driven: bool = False  # the hand is prescribed: w holds the tissue only, and the inputs are the hand's in a step
     modal: Modal | None = None  # the step mode by mode, for conservative models
-
-    @property
-    def size(self) -> int:
-        """Length k of w."""
-        return len(self.at.X)
-
-    @property
-    def steps(self) -> int:
-        """Steps b in one product with ``block``."""
-        return int(np.clip(BLOCK_ENTRIES // max(self.size, 1) ** 2, 1, STEPS))
 
     @property
     def stable(self) -> bool:
         """Nothing grows: by structure where the modes are known, else by the eigenvalues of the model."""
         return self.modal is not None or self.model.stable
 
-    @cached_property
-    def matrix(self) -> Array:
-        """One step, (k, k + m + 1) for m inputs, C order. Raises ModelError: E - dt/2 A is singular."""
-        dt, X = self.dt, self.at.X
-        try:
-            implicit = (self.E - dt / 2 * self.A) @ X
-            matrix = np.linalg.solve(implicit, np.hstack([(self.E + dt / 2 * self.A) @ X, dt * self.loads]))
-        except np.linalg.LinAlgError as error:
-            reason = f"E - dt/2 A is singular at dt = {dt:g} s; take another step"
-            raise ModelError(reason, self.model.name) from error
-        matrix[:, : self.size] = self._exact(matrix[:, : self.size], 1)
-        return np.ascontiguousarray(matrix)
+    def march(self, inputs: Array, start: Array) -> Array:
+        """States w of all steps, (steps + 1, k), for inputs (steps, m) and a start (k,)."""
+        return super().march(inputs, start) if self.modal is None else self.modal.march(inputs, start)
 
-    @cached_property
-    def block(self) -> Array:
-        """[w_{n+1}; ...; w_{n+b}] = block [w_n; u_n; ...; u_{n+b-1}; 1], (b k, k + b m + 1), C order."""
-        k, b, m = self.size, self.steps, self.loads.shape[1] - 1
-        P, Q, f = self.matrix[:, :k], self.matrix[:, k:-1], self.matrix[:, -1]
-        powers = [np.eye(k)]
-        for i in range(1, b + 1):
-            powers.append(self._exact(P @ powers[-1], i))
-        block = np.zeros((b, k, k + b * m + 1))
-        for i in range(b):
-            block[i, :, :k] = powers[i + 1]
-            block[i, :, -1] = sum(powers[: i + 1]) @ f
-            for j in range(i + 1):
-                block[i, :, k + j * m : k + (j + 1) * m] = powers[i - j] @ Q
-        return block.reshape(b * k, -1)
-
-    def _exact(self, P: Array, steps: int) -> Array:
+    def exact(self, P: Array, steps: int) -> Array:
         """Entries of P^steps that are known: rotations, and the free hand."""
         self.at.fix(P, steps * 2 * np.arctan(self.at.omega * self.dt / 2), steps in (1, self.steps))
-        if self.model.fixed_solid and not (self.model.two_way or self.driven):
+        if self.model.hand_first and not (self.model.two_way or self.driven):
             k = 2 * self.model.n_s
             P[:k] = 0.0
             P[:k, :k] = np.eye(k) + np.diag(np.full(self.model.n_s, steps * self.dt), self.model.n_s)
         return P
 
 
-def _coordinates(model: ReducedSystem, driven: bool) -> StepCoordinates:
+def _coordinates(model: EnergySystem, driven: bool) -> StepCoordinates:
     """Energy coordinates: of the tissue alone where the hand is driven, else of the whole state."""
-    apart, k, N = model.fixed_solid and (driven or not model.two_way), 2 * model.n_s, model.N
+    apart, k, N = model.hand_first and (driven or not model.two_way), 2 * model.n_s, model.N
     whole = None if apart or not model.structured else _whole(model)
     if whole is not None:
         return whole
-    tissue = _tissue(model, apart) if model.fixed_solid else None
+    tissue = _tissue(model, apart) if model.hand_first else None
     if driven and tissue is not None:
         return tissue
     X, X_inverse = np.eye(N), np.eye(N)
@@ -219,10 +178,10 @@ def _coordinates(model: ReducedSystem, driven: bool) -> StepCoordinates:
     return StepCoordinates(X, X_inverse, tissue.omega, k)
 
 
-def _tissue(model: ReducedSystem, apart: bool) -> StepCoordinates:
+def _tissue(model: EnergySystem, apart: bool) -> StepCoordinates:
     """Coordinates of the tissue beside the hand's own; ``apart`` if no hand moves with it, so that it has modes."""
-    op, block = model.operators, slice(2 * model.n_s, model.N)
-    E, A, L = op.E[block, block], op.A[block, block], energy_factor(op.energy[block, block])
+    block = slice(2 * model.n_s, model.N)
+    E, A, L = model.E[block, block], model.A[block, block], energy_factor(model.H_tissue[block, block])
     if L is None:
         return StepCoordinates(np.eye(len(A)), np.eye(len(A)), np.zeros(0))
     U, omega = np.eye(len(L)), np.zeros(0)
@@ -235,22 +194,22 @@ def _tissue(model: ReducedSystem, apart: bool) -> StepCoordinates:
     return StepCoordinates(np.linalg.solve(L.T, U), U.T @ L.T, omega, 0, still)
 
 
-def _whole(model: ReducedSystem) -> StepCoordinates | None:
+def _whole(model: EnergySystem) -> StepCoordinates | None:
     """Coordinates w = [modes; still; free] of a conservative model with its hand inside, H = |modes, still|^2 / 2.
 
     H is semidefinite: displacements of the free hand cost nothing. With H = y'y / 2, y = R x and y' = R E^-1 A R^+ y, a
     skew matrix, whose null vectors stand still (a hand that coasts). The null space of H is moved but moves nothing.
     None when the numbers do not show the structure.
     """
-    op = model.operators
-    D = np.sqrt(np.abs(np.diag(op.total)))
+    H = model.H
+    D = np.sqrt(np.abs(np.diag(H)))
     D = np.where(D > 0, D, 1.0)
-    values, V = np.linalg.eigh(op.total / np.outer(D, D))
+    values, V = np.linalg.eigh(H / np.outer(D, D))
     keep = values > NULL_TOLERANCE * values.max(initial=0.0)
     root, V_r, V_0 = np.sqrt(values[keep]), V[:, keep], V[:, ~keep]
     R, R_plus = root[:, None] * V_r.T * D, V_r / D[:, None] / root
     # A = R'R of a canonical model: A R^+ = R', without the rounding of A over a small root
-    S = R @ np.linalg.solve(op.E, R.T if np.array_equal(op.A, op.total) else op.A @ R_plus)
+    S = R @ np.linalg.solve(model.E, R.T if np.array_equal(model.A, H) else model.A @ R_plus)
     if not is_skew(S):
         return None
     U, omega = skew_modes((S - S.T) / 2)
@@ -258,7 +217,7 @@ def _whole(model: ReducedSystem) -> StepCoordinates | None:
     return StepCoordinates(X, X_inverse, omega, 0, len(root) - 2 * len(omega))
 
 
-def propagator(model: ReducedSystem, dt: float, driven: bool = False) -> Propagator:
+def propagator(model: EnergySystem, dt: float, driven: bool = False) -> Propagator:
     """Precompute a step of size dt. Online; not collective.
 
     Args:
@@ -269,62 +228,24 @@ def propagator(model: ReducedSystem, dt: float, driven: bool = False) -> Propaga
     Raises:
         ModelError: E or the midpoint matrix is singular, or ``driven`` without fixed solid modes.
     """
-    op, k = model.operators, 2 * model.n_s
-    if driven and not model.fixed_solid:
+    k = 2 * model.n_s
+    if driven and not model.hand_first:
         raise ModelError("the hand is inside the basis, so it cannot be prescribed; give a force", model.name)
     model.check_independent()
     at, tissue = _coordinates(model, driven), slice(k, model.N)
-    E, A, n_s = op.E, op.A, model.n_s
+    E, A, n_s = model.E, model.A, model.n_s
     if driven:
         # E_yq q_s' with q_s' = mean v_s, E_yv v_s' with v_s' = mean a_s
         inputs = np.hstack([A[tissue, :n_s], A[tissue, n_s:k] - E[tissue, :n_s], -E[tissue, n_s:k]])
         f, E, A = model.f[tissue], E[tissue, tissue], A[tissue, tissue]
     else:
-        inputs, f = op.B, model.f
+        inputs, f = model.B, model.f
     loads = np.hstack([inputs, f[:, None]])
-    step = Propagator(model, dt, at, E, A, loads, driven, modal_of(at, E, A, loads, dt))
-    if step.modal is None:
-        _ = step.block  # needed by every run, and its matrix may be refused
+    modal = modal_of(at, E, A, loads, dt)
+    step = Propagator(dt, E @ at.X, A @ at.X, loads, model, at, driven, modal)
+    if modal is None:
+        try:
+            _ = step.block  # needed by every run, and its matrix may be refused
+        except SolverError as error:
+            raise ModelError(str(error), model.name) from error
     return step
-
-
-def march(step: Propagator, inputs: Array, start: Array) -> Array:
-    """States w of all steps, (steps + 1, k), for inputs (steps, m) and a start (k,)."""
-    if step.modal is not None:
-        return step.modal.march(inputs, start)
-    return np.asarray(march_together([step], inputs[None], start)[0])
-
-
-def march_together(steps: Sequence[Propagator], inputs: Array, start: Array) -> Array:
-    """States (runs, steps + 1, k) for inputs (runs, steps, m) and one start (k,): one product for all runs a block.
-
-    A row of the table is [w of the block; inputs of the next block; 1], so that a single run copies neither inputs nor
-    results in the loop.
-
-    ``steps``: one propagator for all runs, or one for each.
-    """
-    (runs, number, m), k, b = inputs.shape, steps[0].size, steps[0].steps
-    blocks = -(-number // b)
-    rows = np.zeros((blocks + 1, runs, b * k + b * m + 1))
-    padded = np.zeros((runs, blocks * b, m))
-    padded[:, :number] = inputs
-    rows[:-1, :, b * k : -1] = padded.reshape(runs, blocks, b * m).swapaxes(0, 1)
-    rows[:, :, -1] = 1.0
-    rows[0, :, (b - 1) * k : b * k] = start
-    before, after = rows[:-1, :, (b - 1) * k :], rows[1:, :, : b * k]
-    if runs == 1:
-        product, block = np.dot, steps[0].block
-        for old, new in zip(list(before[:, 0]), list(after[:, 0]), strict=True):
-            product(block, old, new)
-    elif len(steps) == 1:
-        right = np.ascontiguousarray(steps[0].block.T)
-        for old, new in zip(before, after, strict=True):
-            new[:] = old @ right
-    else:
-        stack = np.stack([s.block for s in steps])
-        for old, new in zip(before, after, strict=True):
-            new[:] = np.matmul(stack, old[:, :, None])[:, :, 0]
-    states: Array = np.empty((runs, number + 1, k))
-    states[:, 0] = start
-    states[:, 1:] = after.swapaxes(0, 1).reshape(runs, blocks * b, k)[:, :number]
-    return states

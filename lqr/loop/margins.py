@@ -12,13 +12,15 @@ bounds what all inputs withstand at once: every gain in [1/(1+a), 1/(1-a)], ever
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.reduced import ReducedSystem
+from softgrasp.fem.shown import Card, Shown, drawn
 from softgrasp.lqr.loop.controller import Controller
-from softgrasp.reduction.lti import LTI
 
 POINTS = 4000  # frequencies, spaced evenly in log w: 0.3 % apart over five decades
 NEAR = 60  # more around each resonance, where the phase turns at once
@@ -36,14 +38,27 @@ class AxisMargins:
     delay: float  # delay margin [s]
 
 
-@dataclass(frozen=True)
-class LoopMargins:
+@dataclass(frozen=True, repr=False)
+class LoopMargins(Shown):
     """Frequency response of a loop and its margins."""
 
     omega: Array  # frequencies up to the Nyquist frequency of the ticks [rad/s], (F,)
     response: np.ndarray  # frequency response l_i of the loop at each input, (F, n_s)
     axes: tuple[AxisMargins, ...]  # margins at each input, n_s
     distance: float  # smallest singular value of I + L over all frequencies, at most 1 of use
+
+    def card(self) -> Card:
+        """Gain, phase and delay that each input withstands, and all at once."""
+        low, high, phase = self.together
+        rows = [
+            (a.name, f"gain {a.gain_down:.3g} to {a.gain_up:.3g}, phase {a.phase:.3g} deg, delay {a.delay:.3g} s")
+            for a in self.axes
+        ]
+        return Card("LoopMargins", (*rows, ("all at once", f"gain {low:.3g} to {high:.3g}, phase {phase:.3g} deg")))
+
+    def plot(self) -> Any:
+        """Gain and phase of the loop at each input, as ``matplotlib`` figure."""
+        return drawn("loop_bode", self)
 
     @property
     def together(self) -> tuple[float, float, float]:
@@ -52,7 +67,7 @@ class LoopMargins:
         return 1 / (1 + a), 1 / (1 - a) if a < 1 else np.inf, float(np.degrees(2 * np.arcsin(a / 2)))
 
 
-def sampled(plant: LTI, period: float) -> tuple[Array, Array]:
+def sampled(plant: ReducedSystem, period: float) -> tuple[Array, Array]:
     """A_d (N, N) and B_d (N, n_s) of the plant under a load that is held for a period [s]."""
     N, m = plant.B.shape
     solved = np.linalg.solve(plant.E, np.hstack([plant.A, plant.B]))
@@ -67,7 +82,7 @@ def loop_margins(controller: Controller, delay: int = 0) -> LoopMargins:
         controller: gain, plant and period; its limits are left out.
         delay: ticks between a sample and its load.
     """
-    plant, h, K = controller.plant.lti(), controller.period, controller.K
+    plant, h, K = controller.plant, controller.period, controller.K
     A, B = sampled(plant, h)
     poles = np.concatenate([scipy.linalg.eigvals(M, plant.E) for M in (plant.A, plant.under(K).A)])
     omega = _grid(poles, np.pi / h)

@@ -14,10 +14,10 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import states_of
-from softgrasp.reduction.model import ModelError, ReducedSystem
 from softgrasp.reduction.online import run, run_batch
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.propagator import march, propagator, turns
+from softgrasp.reduction.propagator import propagator, turns
+from softgrasp.reduction.system import EnergySystem, ModelError
 from tests.helpers.models import Array, close, make_scene
 from tests.helpers.reduced import DAMPED, KINDS, TINY, model_of, reduced, small_of, step_of, symplectic_basis, wiggle
 
@@ -25,16 +25,16 @@ FALL = {"effects": {"gravity": {"g": [1.0, -9.0]}}}
 CANONICAL = [kind for kind in KINDS if kind[0] == "qp"]
 
 
-def plain_driven(small: ReducedSystem, dt: float, hand: tuple[Array, Array], y: Array) -> Array:
+def plain_driven(small: EnergySystem, dt: float, hand: tuple[Array, Array], y: Array) -> Array:
     """E_yy y' + E_ys [v_s; a_s] = A_yy y + A_ys [q_s; v_s] + f by the midpoint rule as it is written."""
-    op, k, (q, v) = small.operators, 2 * small.n_s, hand
+    k, (q, v) = 2 * small.n_s, hand
     q = np.vstack([q[:1], q[0] + dt * np.cumsum((v[1:] + v[:-1]) / 2, axis=0)])
     s, states = np.hstack([q, v]), [y]
     for n in range(len(q) - 1):
         middle, rate = (s[n] + s[n + 1]) / 2, (s[n + 1] - s[n]) / dt
-        load = op.A[k:, :k] @ middle - op.E[k:, :k] @ rate + small.f[k:]
-        right = (op.E[k:, k:] + dt / 2 * op.A[k:, k:]) @ y + dt * load
-        y = np.linalg.solve(op.E[k:, k:] - dt / 2 * op.A[k:, k:], right)
+        load = small.A[k:, :k] @ middle - small.E[k:, :k] @ rate + small.f[k:]
+        right = (small.E[k:, k:] + dt / 2 * small.A[k:, k:]) @ y + dt * load
+        y = np.linalg.solve(small.E[k:, k:] - dt / 2 * small.A[k:, k:], right)
         states.append(y)
     return np.array(states)
 
@@ -60,8 +60,8 @@ def test_modes_follow_the_plain_rule(comm: MPI.Intracomm, kind: tuple[Any, ...],
         step, u = propagator(small, dt), wiggle(steps, dt)
         assert step.modal is not None
         start = step.at.X_inverse @ x0
-        blocks = march(replace(step, modal=None), u, start)
-        assert close(march(step, u, start), blocks) < 1e-10  # as above
+        blocks = replace(step, modal=None).march(u, start)
+        assert close(step.march(u, start), blocks) < 1e-10  # as above
 
 
 def test_turns_are_those_of_the_angles() -> None:
