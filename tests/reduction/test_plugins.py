@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import softgrasp as sg
 from softgrasp.fem.petsc import times_columns, total
 from softgrasp.reduction.bases.plugins import load_plugins, mass_orthonormal
 from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import BasisError, states_of
-from softgrasp.study.cli import app
 
 EXAMPLE = Path(__file__).parents[2] / "demos" / "static_responses.py"
 WRONG = {
@@ -86,15 +84,3 @@ def test_dependent_displacements_and_wrong_shapes_are_refused(tmp_path: Path) ->
     load_plugins([file])
     with pytest.raises(BasisError, match=r"flat: the file gave displacements of shape \(3, 5\)"):
         make_basis("flat", states_of(model.system), 14)
-
-
-@pytest.mark.serial
-def test_reduce_compares_it_with_the_others(tmp_path: Path) -> None:
-    keys = [f"reduction.plugins=['{EXAMPLE}']", "reduction.methods=['static_responses', 'craig_bampton']",
-            "reduction.N=[14]", "reduction.train=[]", "reduction.validation=0", "tissue.cells=[4, 8]",
-            "time.steps=100"]  # fmt: skip
-    words = ["reduce", "paper_forward", "--no-pictures", "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(app, [*words, *(word for key in keys for word in ("-s", key))])
-    assert result.exit_code == 0, result.output
-    assert "static responses" in (tmp_path / "out" / "report.html").read_text()
-    assert (tmp_path / "out" / "models" / "static_responses.h5").exists()
