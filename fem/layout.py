@@ -11,6 +11,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import Shown
 
 Place = tuple[tuple[float, ...], int, int]  # of a node: coordinates [m], owning rank, its number there
 
@@ -31,8 +32,8 @@ class Patches:
     count: int  # number of owned free vertices
 
 
-@dataclass(frozen=True)
-class BlockLayout:
+@dataclass(frozen=True, repr=False)
+class BlockLayout(Shown):
     """Sizes and ownership of q = [q_s; q_e]."""
 
     comm: MPI.Intracomm  # of the tissue blocks

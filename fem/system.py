@@ -17,6 +17,7 @@ import numpy as np
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc, combine, times_columns, total
+from softgrasp.fem.shown import Shown
 
 if TYPE_CHECKING:  # only scenes with finite strain load it
     from softgrasp.fem.strain.points import QuadraturePoints
@@ -61,8 +62,8 @@ class Damping:
         return self.alpha if self.in_space else 0.0
 
 
-@dataclass(frozen=True)
-class BlockSystem:
+@dataclass(frozen=True, repr=False)
+class BlockSystem(Shown):
     """All operators of one scene, in z = q_e - T q_s, the displacement relative to the hand [SBRH21].
 
     K_ee = sum over layers of mu K_mu + lambda K_lambda, M_ee = sum of rho M_1; the equations stand at the top of this

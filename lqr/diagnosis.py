@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import Shown
 from softgrasp.lqr.dense.modal import ENOUGH, ModeRates, closed_loop_rates, enough_damping, lost_sentence, lowest_plant
 from softgrasp.lqr.plant.checks import EPS, MODAL_KEY, ControlError, check_finite, check_weights, square_root
 from softgrasp.lqr.plant.problem import RiccatiProblem
@@ -28,8 +29,8 @@ class Finding:
     sentence: str  # the fault and its remedy
 
 
-@dataclass(frozen=True)
-class Diagnosis:
+@dataclass(frozen=True, repr=False)
+class Diagnosis(Shown):
     """Findings and estimated poles from before the solve."""
 
     findings: tuple[Finding, ...]  # errors and warnings, errors first

@@ -12,11 +12,12 @@ from mpi4py import MPI
 
 from softgrasp.fem.columns import TURNS, hand_columns
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import Card, Shown, listed
 from softgrasp.reduction.bases.basis import ReductionError
 
 
-@dataclass(frozen=True)
-class LTI:
+@dataclass(frozen=True, repr=False)
+class LTI(Shown):
     """E x' = A x + B u, y = C x: deviations from a state of rest, so that gravity drops out.
 
     >>> import softgrasp as sg
@@ -33,6 +34,11 @@ class LTI:
     states: tuple[str, ...]  # names of the states with their units, "q_x [m]"
     inputs: tuple[str, ...]  # names of the inputs with their units, "force_x [N]"
     outputs: tuple[str, ...]  # names of the outputs with their units, "tip_x [m]"
+
+    def card(self) -> Card:
+        """Dimension, inputs and outputs."""
+        rows = (("states", str(len(self.E))), ("inputs", listed(self.inputs)), ("outputs", listed(self.outputs)))
+        return Card("LTI E x' = A x + B u, y = C x", rows)
 
     def at(self, s: Sequence[complex] | np.ndarray) -> np.ndarray:
         """Transfer function C (s E - A)^{-1} B at points s [1/s], (len(s), p, n_s)."""

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem.errors import SoftgraspError
-from softgrasp.fem.material import LayerMaterial
+from softgrasp.fem.material import LayerMaterial, in_words
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import Card, Shown, amount, listed
 from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError, Structure
 from softgrasp.reduction.canonical import canonical_operators
 from softgrasp.reduction.galerkin import galerkin_operators
@@ -44,8 +45,8 @@ class Outputs:
     names: tuple[str, ...] = ()  # one per component
 
 
-@dataclass(frozen=True)
-class ReducedSystem:
+@dataclass(frozen=True, repr=False)
+class ReducedSystem(Shown):
     """E x' = A x + B u + f, q_s = S_q x, v_s = S_v x, y = C_z x + C_s q_s at one parameter, of dimension N.
 
     Everything that a run needs, nothing of full order. The state x has no unit of its own: with fixed solid modes its
@@ -61,6 +62,22 @@ class ReducedSystem:
     two_way: bool  # the hand feels the tissue
     structured: bool  # without damping the model conserves its energy by construction
     scale: float = 1.0  # density over that of the projection (canonical models, else 1)
+
+    def card(self) -> Card:
+        """Dimension, stability and outputs."""
+        rows = (
+            ("dimension", f"N = {self.N}, hand {self.n_s}"),
+            ("stable", self.verdict()),
+            ("outputs", listed(self.outputs.names)),
+        )
+        return Card(f"ReducedSystem {self.name}", rows)
+
+    def verdict(self) -> str:
+        """Whether the system is stable, with the largest real part of an eigenvalue, or why there is none."""
+        try:
+            return f"{'yes' if self.stable else 'no'}, spectral abscissa {amount(self.spectral_abscissa, '1/s')}"
+        except ModelError as error:
+            return f"unknown: {error}"
 
     @property
     def N(self) -> int:
@@ -148,8 +165,8 @@ class ReducedSystem:
         return x
 
 
-@dataclass(frozen=True)
-class ReducedModel:
+@dataclass(frozen=True, repr=False)
+class ReducedModel(Shown):
     """E x' = A x + B u + F g for all lambda, mu, rho of every layer: a new parameter costs no full-order work.
 
     The matrices are sums over the layers, A = A_0 + sum_l lambda_l A_lambda,l + mu_l A_mu,l and so on, which
@@ -196,6 +213,17 @@ class ReducedModel:
     """Settings of that scene that a run depends on, see :mod:`softgrasp.reduction.origin`; or empty."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Offline time by stage [s]."""
+
+    def card(self) -> Card:
+        """Dimension, structure, stability at the scene's materials, outputs."""
+        rows = (
+            ("dimension", f"N = {self.N}, {'hand kept apart' if self.fixed_solid else 'hand and tissue together'}"),
+            ("structure", f"{self.structure.replace('_', ' ')}, in {self.coordinates[0]} and {self.coordinates[1]}"),
+            ("material", in_words(self.materials)),
+            ("stable there", self.at().verdict()),
+            ("outputs", listed(self.outputs.names)),
+        )
+        return Card(f"ReducedModel {self.name}", rows)
 
     def at(self, materials: tuple[LayerMaterial, ...] | None = None, gravity: Array | None = None) -> ReducedSystem:
         """Assemble E x' = A x + B u + F g at new materials and gravity. Online; not collective.

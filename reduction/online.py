@@ -7,17 +7,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgrasp.fem.columns import TURNS
+from softgrasp.fem.labelled import Labelled, Quantity, of_hand
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.reduced import march_together
+from softgrasp.fem.shown import Card, Shown, amount, counted, listed
 from softgrasp.reduction.model import ModelError, ReducedSystem, UnstableModelError
-from softgrasp.reduction.propagator import Propagator, march, march_together, propagator
+from softgrasp.reduction.propagator import Propagator, propagator
 
 # byte of the matrices of a batch up to which all models step together; somewhere between 4 and 11 MB they leave the
 # cache, and one model after the other is faster (docs/benchmarks.md)
 TOGETHER = 5_000_000
 
 
-@dataclass(frozen=True)
-class ReducedTrajectory:
+@dataclass(frozen=True, repr=False)
+class ReducedTrajectory(Shown, Labelled):
     """What a reduced run returns."""
 
     times: Array  # (steps + 1,) [s]
@@ -26,6 +30,25 @@ class ReducedTrajectory:
     v_s: Array  # velocity of the hand, (steps + 1, n_s) [m/s, rad/s]
     outputs: Array  # y, (steps + 1, p) [m]
     output_names: tuple[str, ...]  # one per component
+
+    def card(self) -> Card:
+        """Steps, dimension and outputs."""
+        rows = (
+            ("time", f"{counted(len(self.times) - 1, 'step')} to {amount(self.times[-1], 's')}"),
+            ("dimension", f"N = {self.x.shape[1]}"),
+            ("outputs", listed(self.output_names)),
+        )
+        return Card("Trajectory of a reduced model", rows)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Outputs and hand over time with their labels and units."""
+        units = tuple("rad" if name.rsplit("_", 1)[-1] in TURNS else "m" for name in self.output_names)
+        return {
+            "outputs": Quantity(self.outputs, self.output_names, units, "output"),
+            "q_s": of_hand(self.q_s, self.output_names),
+            "v_s": of_hand(self.v_s, self.output_names, rate="/s"),
+        }
 
 
 def _check_stable(step: Propagator, allow_unstable: bool) -> None:
@@ -70,7 +93,7 @@ def run(
     if hand is None and (inputs.ndim != 2 or inputs.shape[1] != model.n_s or len(inputs) < 1):
         raise ModelError(f"the force has the shape {inputs.shape}; it must be (steps, {model.n_s})")
     start = np.zeros(model.N) if x0 is None else np.asarray(x0, dtype=float)
-    w = march(step, inputs, step.at.X_inverse @ start[model.N - step.size :])
+    w = step.march(inputs, step.at.X_inverse @ start[model.N - step.size :])
     return trajectory(step, w, hand)
 
 
@@ -210,7 +233,7 @@ def run_batch(
     many = len(steps) > 1
     rest, alone = np.zeros(steps[0].size), all(s.modal is not None for s in steps)
     if many and (alone or sum(s.block.nbytes for s in steps) > TOGETHER):
-        states: Iterable[Array] = (march(s, inputs, rest) for s, inputs in zip(steps, u, strict=True))
+        states: Iterable[Array] = (s.march(inputs, rest) for s, inputs in zip(steps, u, strict=True))
     else:
         states = march_together(steps, u, rest)
     return [trajectory(steps[i if many else 0], w, own[i]) for i, w in enumerate(states)]

@@ -15,18 +15,16 @@ so that c_n = e^{i a n} (c_0 + sum_m e^{-i a m} ...): a whole run is a sum, with
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.reduced import MidpointSteps
 from softgrasp.reduction.model import ModelError, ReducedSystem
 from softgrasp.reduction.spectrum import NULL_TOLERANCE, balanced, energy_factor, is_skew, skew_modes
 
-STEPS = 8  # in one product: more would not gain at N = 30, where a product costs as much as the call
-BLOCK_ENTRIES = 32_768  # of the matrix of several steps: 256 kB stay in a core's own cache
 SLOW = 0.01  # sine or cosine below which one unit in the last place of the other turns by 1e-12 of the angle
 TURNS = 32  # angles whose sine and cosine are computed; the others are products of two of them
 
@@ -134,66 +132,27 @@ def modal_of(at: StepCoordinates, E: Array, A: Array, loads: Array, dt: float) -
 
 
 @dataclass(frozen=True)
-class Propagator:
-    """One step in energy coordinates, w_{n+1} = matrix [w_n; u_n; 1], and b of them at once.
+class Propagator(MidpointSteps):
+    """Steps of a reduced model in energy coordinates x = X w; the matrices E and A have the columns of X.
 
-    A conservative model also has ``modal``, which runs without either; they are then made when they are first used.
+    A conservative model also has ``modal``, which runs without a matrix of the steps.
     """
 
     model: ReducedSystem  # what it steps
-    dt: float  # step [s]
     at: StepCoordinates  # coordinates, x = X w
-    E: Array  # E of the stepped equations, all of the model or those of its tissue, (n, n)
-    A: Array  # A of the stepped equations, (n, n)
-    loads: Array  # [input of u, constant load], (N or the tissue's own coordinates, m + 1)
     driven: bool = False  # the hand is prescribed: w holds the tissue only, and the inputs are the hand's in a step
     modal: Modal | None = None  # the step mode by mode, for conservative models
-
-    @property
-    def size(self) -> int:
-        """Length k of w."""
-        return len(self.at.X)
-
-    @property
-    def steps(self) -> int:
-        """Steps b in one product with ``block``."""
-        return int(np.clip(BLOCK_ENTRIES // max(self.size, 1) ** 2, 1, STEPS))
 
     @property
     def stable(self) -> bool:
         """Nothing grows: by structure where the modes are known, else by the eigenvalues of the model."""
         return self.modal is not None or self.model.stable
 
-    @cached_property
-    def matrix(self) -> Array:
-        """One step, (k, k + m + 1) for m inputs, C order. Raises ModelError: E - dt/2 A is singular."""
-        dt, X = self.dt, self.at.X
-        try:
-            implicit = (self.E - dt / 2 * self.A) @ X
-            matrix = np.linalg.solve(implicit, np.hstack([(self.E + dt / 2 * self.A) @ X, dt * self.loads]))
-        except np.linalg.LinAlgError as error:
-            reason = f"E - dt/2 A is singular at dt = {dt:g} s; take another step"
-            raise ModelError(reason, self.model.name) from error
-        matrix[:, : self.size] = self._exact(matrix[:, : self.size], 1)
-        return np.ascontiguousarray(matrix)
+    def march(self, inputs: Array, start: Array) -> Array:
+        """States w of all steps, (steps + 1, k), for inputs (steps, m) and a start (k,)."""
+        return super().march(inputs, start) if self.modal is None else self.modal.march(inputs, start)
 
-    @cached_property
-    def block(self) -> Array:
-        """[w_{n+1}; ...; w_{n+b}] = block [w_n; u_n; ...; u_{n+b-1}; 1], (b k, k + b m + 1), C order."""
-        k, b, m = self.size, self.steps, self.loads.shape[1] - 1
-        P, Q, f = self.matrix[:, :k], self.matrix[:, k:-1], self.matrix[:, -1]
-        powers = [np.eye(k)]
-        for i in range(1, b + 1):
-            powers.append(self._exact(P @ powers[-1], i))
-        block = np.zeros((b, k, k + b * m + 1))
-        for i in range(b):
-            block[i, :, :k] = powers[i + 1]
-            block[i, :, -1] = sum(powers[: i + 1]) @ f
-            for j in range(i + 1):
-                block[i, :, k + j * m : k + (j + 1) * m] = powers[i - j] @ Q
-        return block.reshape(b * k, -1)
-
-    def _exact(self, P: Array, steps: int) -> Array:
+    def exact(self, P: Array, steps: int) -> Array:
         """Entries of P^steps that are known: rotations, and the free hand."""
         self.at.fix(P, steps * 2 * np.arctan(self.at.omega * self.dt / 2), steps in (1, self.steps))
         if self.model.fixed_solid and not (self.model.two_way or self.driven):
@@ -282,49 +241,11 @@ def propagator(model: ReducedSystem, dt: float, driven: bool = False) -> Propaga
     else:
         inputs, f = op.B, model.f
     loads = np.hstack([inputs, f[:, None]])
-    step = Propagator(model, dt, at, E, A, loads, driven, modal_of(at, E, A, loads, dt))
-    if step.modal is None:
-        _ = step.block  # needed by every run, and its matrix may be refused
+    modal = modal_of(at, E, A, loads, dt)
+    step = Propagator(dt, E @ at.X, A @ at.X, loads, model, at, driven, modal)
+    if modal is None:
+        try:
+            _ = step.block  # needed by every run, and its matrix may be refused
+        except SolverError as error:
+            raise ModelError(str(error), model.name) from error
     return step
-
-
-def march(step: Propagator, inputs: Array, start: Array) -> Array:
-    """States w of all steps, (steps + 1, k), for inputs (steps, m) and a start (k,)."""
-    if step.modal is not None:
-        return step.modal.march(inputs, start)
-    return np.asarray(march_together([step], inputs[None], start)[0])
-
-
-def march_together(steps: Sequence[Propagator], inputs: Array, start: Array) -> Array:
-    """States (runs, steps + 1, k) for inputs (runs, steps, m) and one start (k,): one product for all runs a block.
-
-    A row of the table is [w of the block; inputs of the next block; 1], so that a single run copies neither inputs nor
-    results in the loop.
-
-    ``steps``: one propagator for all runs, or one for each.
-    """
-    (runs, number, m), k, b = inputs.shape, steps[0].size, steps[0].steps
-    blocks = -(-number // b)
-    rows = np.zeros((blocks + 1, runs, b * k + b * m + 1))
-    padded = np.zeros((runs, blocks * b, m))
-    padded[:, :number] = inputs
-    rows[:-1, :, b * k : -1] = padded.reshape(runs, blocks, b * m).swapaxes(0, 1)
-    rows[:, :, -1] = 1.0
-    rows[0, :, (b - 1) * k : b * k] = start
-    before, after = rows[:-1, :, (b - 1) * k :], rows[1:, :, : b * k]
-    if runs == 1:
-        product, block = np.dot, steps[0].block
-        for old, new in zip(list(before[:, 0]), list(after[:, 0]), strict=True):
-            product(block, old, new)
-    elif len(steps) == 1:
-        right = np.ascontiguousarray(steps[0].block.T)
-        for old, new in zip(before, after, strict=True):
-            new[:] = old @ right
-    else:
-        stack = np.stack([s.block for s in steps])
-        for old, new in zip(before, after, strict=True):
-            new[:] = np.matmul(stack, old[:, :, None])[:, :, 0]
-    states: Array = np.empty((runs, number + 1, k))
-    states[:, 0] = start
-    states[:, 1:] = after.swapaxes(0, 1).reshape(runs, blocks * b, k)[:, :number]
-    return states

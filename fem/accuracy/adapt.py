@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -20,6 +20,7 @@ from softgrasp.fem.model.build import MeshEstimate, Model
 from softgrasp.fem.model.build import build as build_on
 from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.scene.file import as_overrides
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene
@@ -40,6 +41,7 @@ def build(
     *,
     mesh: TissueMesh | None = None,
     steps: bool = True,
+    **tables: Any,
 ) -> Model:
     """M q'' + D q' + K q = f + B_u u for q = [q_s; q_e], as in [SBRH21]: mesh, assemble, couple. Collective.
 
@@ -49,6 +51,7 @@ def build(
     Args:
         scene: a scene, the path of its file, or the name of one that ships.
         overrides: "section.key=value" each, as after ``--set``; for a file or a name.
+        tables: the same by sections, ``tissue={"cells": [4, 8]}``.
         mesh: on which, as it is; None makes that of the scene.
         steps: whether the time steps have to carry the tolerance too: those of the scene's own run.
 
@@ -61,9 +64,11 @@ def build(
     >>> import softgrasp as sg
     >>> sg.build("paper_forward").states
     1916
+    >>> sg.build("paper_forward", tissue={"cells": [4, 8]}).states
+    160
     """
     begin = time.perf_counter()
-    model = build_on(scene, overrides, comm, mesh=mesh)
+    model = build_on(scene, [*overrides, *as_overrides(tables)], comm, mesh=mesh)
     scene, refine = model.scene, model.scene.tissue.refine
     if refine is None or refine.tolerance is None or refine.passes == 0 or mesh is not None:
         return model

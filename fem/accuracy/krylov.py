@@ -20,6 +20,7 @@ import scipy.linalg
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs, output_columns
 from softgrasp.fem.petsc import Array, normalising, times_columns, total
+from softgrasp.fem.reduced import MidpointSteps
 from softgrasp.fem.run.motion import force_values, free_table
 from softgrasp.fem.solve.stiffness import factored_stiffness
 from softgrasp.fem.system import BlockSystem
@@ -136,27 +137,24 @@ def run_krylov(small: KrylovModel, steps: int | None = None) -> KrylovRun:
         M = np.block([[system.M_hand + R, G.T], [G, small.M]])
         D = np.block([[alpha * R, alpha * G.T], [alpha * G, small.D]])
         K = np.diag(np.repeat([0.0, 1.0], [n_s, len(z)]))
-        B = np.block([[np.eye(n_s), R], [np.zeros_like(G), G]])
+        B, fall = np.eye(len(M), n_s), np.vstack([R, G]) @ g
         u = force_values(scene, n_s, system.M_hand) + system.weight
-        X, a = _midpoint(M, D, K, B, np.hstack([u, np.tile(g, (n, 1))]), np.append(np.zeros(n_s), z), dt)
+        X, a = _midpoint(M, D, K, B, fall, u, np.append(np.zeros(n_s), z), dt)
         q, Z, accelerations = X[:, :n_s], X[:, n_s:], a[:, n_s:]
         loads = g - a[:, :n_s] - alpha * np.diff(q, axis=0) / dt
     else:
         table, _ = free_table(system, scene, dt)
         q, loads = table.q, g - table.a - alpha * (table.v[1:] + table.v[:-1]) / 2
-        Z, accelerations = _midpoint(small.M, small.D, np.eye(len(z)), small.G, loads, z, dt)
+        Z, accelerations = _midpoint(small.M, small.D, np.eye(len(z)), small.G, 0 * z, loads, z, dt)
     return KrylovRun(Z @ small.C.T, q @ small.C_s.T, loads, accelerations)
 
 
-def _midpoint(M: Array, D: Array, K: Array, B: Array, f: Array, x: Array, dt: float) -> tuple[Array, Array]:
-    """M x'' + D x' + K x = B f from rest at x, f in the middle of the steps, (n, k): x (n + 1, N) and x'' (n, N)."""
-    n, s = len(f), 2 / dt
-    inverse = np.linalg.inv(K + s * D + s * s * M)
-    half = np.hstack([-inverse @ K, s * s * inverse @ M])  # w = x_mid - x_n from x_n and u_n = x'_n / s
-    T = np.vstack([2 * half, 2 * half]) + np.diag(np.repeat([1.0, -1.0], len(x)))  # u_{n+1} = 2 w - u_n
-    Y = np.empty((n + 1, 2 * len(x)))
-    Y[0, : len(x)], Y[0, len(x) :] = x, 0.0
-    Y[1:] = np.tile(2 * f @ (inverse @ B).T, 2)
-    for i in range(n):
-        Y[i + 1] += T @ Y[i]
-    return Y[:, : len(x)], s * s * np.diff(Y[:, len(x) :], axis=0) / 2
+def _midpoint(
+    M: Array, D: Array, K: Array, B: Array, f: Array, inputs: Array, x: Array, dt: float
+) -> tuple[Array, Array]:
+    """M x'' + D x' + K x = B u + f from rest at x for inputs u at the midpoints: x (n + 1, N) and x'' (n, N)."""
+    N, one = len(x), np.eye(len(x))
+    E, A = scipy.linalg.block_diag(one, M), np.block([[0 * one, one], [-K, -D]])
+    loads = np.vstack([np.zeros((N, B.shape[1] + 1)), np.column_stack([B, f])])
+    w = MidpointSteps(dt, E, A, loads).march(inputs, np.append(x, np.zeros(N)))
+    return w[:, :N], np.diff(w[:, N:], axis=0) / dt

@@ -1,4 +1,4 @@
-"""A scene by its keys, the mesh that was read and its csv file: one hash of all of it, or key by key."""
+"""A scene by its keys, the mesh that was read and its csv files: one hash of all of it, or key by key."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from collections.abc import Iterable
 from typing import Any
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.scene.obstacles import replace_paths
 from softgrasp.fem.scene.scene import Scene
 
 
 def scene_hash(scene: Scene, without: Iterable[str] = ("name", "description")) -> str:
-    """SHA-256 of the resolved scene, of the contents of its mesh file and of the bytes of its csv file, 64 hex digits.
+    """SHA-256 of the resolved scene, of the contents of its mesh file and of the bytes of its csv files, 64 hex digits.
 
     Top-level keys in `without` do not count; nor do folder, name and format of the files. The mesh is the one that the
     model of this scene was built with; without a model it is read. Raises SceneError, MeshError: a file that the scene
@@ -43,7 +44,8 @@ def _resolved(scene: Scene, without: Iterable[str]) -> dict[str, Any]:
     if tissue.get("mesh") is not None:
         tissue["mesh"] = scene._mesh_digest or _mesh_digest(scene)
     if motion.get("csv") is not None:
-        motion["csv"] = hashlib.sha256(_bytes(scene, motion["csv"], "motion.csv")).hexdigest()
+        motion["csv"] = _digest(scene, motion["csv"], "motion.csv")
+    replace_paths(data, lambda name: _digest(scene, name, "csv of an obstacle's path"))
     return data
 
 
@@ -55,8 +57,8 @@ def _mesh_digest(scene: Scene) -> str:
     return str(load_arrays(path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit).known["digest"])
 
 
-def _bytes(scene: Scene, name: str, key: str) -> bytes:
+def _digest(scene: Scene, name: str, key: str) -> str:
     try:
-        return scene.path(name).read_bytes()
+        return hashlib.sha256(scene.path(name).read_bytes()).hexdigest()
     except OSError as error:
         raise SceneError(f"scene '{scene.name}': {key} = '{name}' cannot be read ({error.strerror})") from None

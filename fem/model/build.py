@@ -17,7 +17,7 @@ from softgrasp.fem.effects.damping import operator as damping_operator
 from softgrasp.fem.effects.gravity import acceleration
 from softgrasp.fem.effects.rotation import hand_mass
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.material import LayerMaterial
+from softgrasp.fem.material import LayerMaterial, in_words
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.mesh.scene_hash import scene_hash, scene_keys
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
@@ -27,7 +27,9 @@ from softgrasp.fem.model.memory import box_simplices, check_memory
 from softgrasp.fem.model.outputs import Output, make_outputs, output_columns
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective
+from softgrasp.fem.scene.materials import lame
 from softgrasp.fem.scene.scene import Scene, check_dimension
+from softgrasp.fem.shown import Card, Shown, listed
 from softgrasp.fem.system import BlockSystem, LayerBlocks, coupling, tissue_matrices
 
 
@@ -76,8 +78,8 @@ class Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + elapsed
 
 
-@dataclass(frozen=True)
-class Model:
+@dataclass(frozen=True, repr=False)
+class Model(Shown):
     """The full finite element model of a scene.
 
     >>> import softgrasp as sg
@@ -98,6 +100,26 @@ class Model:
     """Time of each stage of building and running, on the slowest rank [s]."""
     accuracy: MeshEstimate | None = None
     """Estimate of the error of the mesh; None where the scene has no tolerance."""
+
+    def card(self) -> Card:
+        """Mesh, unknowns, materials, effects and the error of the mesh."""
+        layout, scene, error = self.system.layout, self.scene, self.accuracy
+        on = [name for name, value in scene.effects if value not in (None, False)]
+        estimate = "not estimated" if error is None else f"{100 * error.estimate:.2g} % of the deformation, estimated"
+        rows = (
+            ("mesh", f"{layout.dimension}D, P{layout.order}, {self.cells} cells"),
+            ("unknowns", f"hand {layout.n_s}, tissue {layout.n_e}, {self.states} states"),
+            ("material", in_words(self.system.materials)),
+            ("effects", listed(on)),
+            ("motion", f"{scene.motion.profile}, {scene.time.steps} steps to {scene.time_end:g} s"),
+            ("error of the mesh", estimate),
+        )
+        return Card(f"Model {scene.name}", rows)
+
+    @property
+    def cells(self) -> int:
+        """Number of cells of the whole mesh."""
+        return int(self.space.mesh.mesh.topology.index_map(self.system.layout.dimension).size_global)
 
     @property
     def states(self) -> int:
@@ -131,7 +153,15 @@ class Model:
         """
         return self.space.nodal(z + self.system.T @ q_s, self.space.R @ q_s)
 
-    def with_materials(self, lam: float | None = None, mu: float | None = None, rho: float | None = None) -> Model:
+    def with_materials(
+        self,
+        lam: float | None = None,
+        mu: float | None = None,
+        rho: float | None = None,
+        *,
+        young: float | None = None,
+        poisson: float | None = None,
+    ) -> Model:
         """The same mesh with other numbers in every layer: K = mu K_mu + lambda K_lambda, M = rho M_1. Collective.
 
         Only sums of matrices that are there; nothing is assembled. The error of the mesh is another and is left out.
@@ -140,9 +170,16 @@ class Model:
             lam: first Lame parameter [Pa]; None keeps that of each layer.
             mu: shear modulus [Pa]; None keeps that of each layer.
             rho: density [kg/m^3]; None keeps that of each layer.
+            young, poisson: Young's modulus [Pa] and Poisson's ratio [1], together, instead of lam and mu.
 
         Raises SceneError: a number is not positive (lam: not above -2 mu / d), or not finite.
         """
+        if young is not None or poisson is not None:
+            if young is None or poisson is None or lam is not None or mu is not None:
+                raise SceneError("young and poisson go together, without lam and mu; give one pair")
+            if not (np.isfinite(young) and young > 0 and -1 < poisson < 0.5):
+                raise SceneError(f"young = {young}, poisson = {poisson}: young must be > 0, poisson between -1 and 0.5")
+            lam, mu = lame(young, poisson)
         changes = {key: value for key, value in (("lam", lam), ("mu", mu), ("rho", rho)) if value is not None}
         d = self.system.layout.dimension
         materials = tuple(replace(m, **changes) for m in self.system.materials)
@@ -153,6 +190,17 @@ class Model:
                     "must be positive"
                 )
         return replace(self, system=self.system.with_materials(materials), accuracy=None)
+
+
+def checked_model(model: object) -> Model:
+    """The model as it is.
+
+    Raises SceneError: it is a scene or a name, of which :func:`build` would make a model.
+    """
+    if isinstance(model, Model):
+        return model
+    shown = f'"{model}"' if isinstance(model, str) else "scene" if isinstance(model, Scene) else type(model).__name__
+    raise SceneError(f"a model is needed; write softgrasp.build({shown}) where {shown} stands")
 
 
 def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[LayerMaterial, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -16,7 +15,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.scene.text import read_table
+from softgrasp.fem.scene.table import read_csv
 from softgrasp.fem.system import BlockSystem
 
 
@@ -39,33 +38,6 @@ def quintic(t: Array, duration: float) -> tuple[Array, Array, Array]:
     ds = 30 * x**2 * (1 - x) ** 2 / duration
     dds = 60 * x * (1 - x) * (1 - 2 * x) / duration**2
     return s, ds, dds
-
-
-def read_csv(path: Path, columns: int, end: float | None = None, key: str = "motion.csv") -> tuple[Array, Array]:
-    """Read times (steps,) and values (steps, columns) of a trajectory.
-
-    Args:
-        columns: degrees of freedom of the hand.
-        end: of the run [s]; None takes the file as long as it is, from 0 on.
-        key: who names the file, for the messages.
-
-    Raises SceneError: the file is missing, not numeric, not increasing in time or does not cover [0, end].
-    """
-    try:
-        table = np.array(read_table(path, columns + 1))
-    except OSError as error:
-        raise SceneError(f"{key}: {path} cannot be read ({error.strerror}); name an existing CSV file") from error
-    except ValueError as error:
-        raise SceneError(f"{key}: {path} {error} (time, then one per hand degree of freedom)") from error
-    if len(table) < 2:
-        raise SceneError(f"{key}: {path} has {len(table)} rows of numbers; it must have at least two")
-    if (np.diff(table[:, 0]) <= 0).any():
-        raise SceneError(f"{key}: the times in {path} must increase from row to row")
-    if end is None and table[0, 0] != 0:
-        raise SceneError(f"{key}: the times in {path} must begin at 0, not at {table[0, 0]:g} s")
-    if end is not None and (table[0, 0] > 0 or table[-1, 0] < end * (1 - 1e-12)):
-        raise SceneError(f"{key}: {path} covers {table[0, 0]:g} to {table[-1, 0]:g} s, the run needs 0 to {end:g} s")
-    return table[:, 0], table[:, 1:]
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from softgrasp.fem.errors import (
     SolverError,
     raise_on_all_ranks,
 )
-from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.build import Model, checked_model
 from softgrasp.fem.model.memory import solver_of
 from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.owned import locked
@@ -323,7 +323,7 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
     >>> sg.simulate(model).energy_drift < 1e-12
     True
     """
-    options, kept = options or RunOptions(), model.scene.output
+    options, kept = options or RunOptions(), checked_model(model).scene.output
     if kept.snapshots != "hdf5" and not (kept.checkpoint_every or options.resume or options.until is not None):
         return _simulate(model, options, force)
     with locked(model.system.layout.comm, options.directory):

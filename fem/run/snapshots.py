@@ -16,14 +16,15 @@ from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.resources import MARGIN, check_room, free_memory
 from softgrasp.fem.run.midpoint import TissueState, state_on
+from softgrasp.fem.shown import Shown
 from softgrasp.fem.system import BlockSystem
 
 DAMAGE = (OSError, KeyError, ValueError, TypeError, RuntimeError)  # what h5py raises of files that are not whole
 BUFFER_BYTES = 64 * 2**20  # per rank; large enough that HDF5 writes whole chunks
 
 
-@dataclass(frozen=True)
-class Snapshots:
+@dataclass(frozen=True, repr=False)
+class Snapshots(Shown):
     """Hand and relative tissue states at some steps."""
 
     layout: BlockLayout  # sizes and ownership

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from softgrasp.fem.columns import Columns, labels
+from softgrasp.fem.labelled import Labelled, Quantity, of_columns, of_hand
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.shown import Card, Shown, amount, counted, listed
 from softgrasp.fem.solve.solvers import SolverUsed
 
 if TYPE_CHECKING:
     from softgrasp.fem.strain.newton import NewtonFigures
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, repr=False)
+class Trajectory(Shown, Labelled):
     """Motion, outputs, force and figures of a run of the full model.
 
     >>> import softgrasp as sg
@@ -59,6 +63,34 @@ class Trajectory:
     """Number of steps since the run was started or resumed [1]."""
     newton: NewtonFigures | None = None
     """Convergence of the steps at finite strain; None where they are linear."""
+
+    def card(self) -> Card:
+        """Steps, outputs, deformation, energy drift, solver."""
+        kept = "none in memory" if self.snapshots is None else counted(len(self.snapshots.steps), "state")
+        rows = (
+            ("time", f"{counted(len(self.times) - 1, 'step')} to {amount(self.times[-1], 's')}, snapshots: {kept}"),
+            ("outputs", listed(self.output_names)),
+            ("deformation", f"at most {amount(np.abs(self.outputs - self.outputs_rigid).max(initial=0.0), 'm')}"),
+            ("energy drift", amount(self.energy_drift)),
+            ("solver", f"{self.solver.name} ({self.solver.package})"),
+        )
+        return Card("Trajectory of the full model", rows)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Outputs, hand and force over time with their labels and units."""
+        return {
+            "outputs": of_columns(self.outputs, self.columns, "output"),
+            "outputs_rigid": of_columns(self.outputs_rigid, self.columns, "output"),
+            "q_s": of_hand(self.q_s, self.output_names),
+            "v_s": of_hand(self.v_s, self.output_names, rate="/s"),
+            "force": of_hand(self.force, self.output_names, load=True),
+        }
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Energy drift and solver."""
+        return {"energy_drift": self.energy_drift, "solver": self.solver.name}
 
     @property
     def output_names(self) -> tuple[str, ...]:

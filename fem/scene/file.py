@@ -7,7 +7,7 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from softgrasp import PACKAGE
 from softgrasp.fem.errors import SceneError, shortened
+from softgrasp.fem.scene.obstacles import replace_paths
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.text import check_values, parse_toml, read_text
 
@@ -47,6 +48,7 @@ _FORMS = {
     "contact.sides": 'sides = ["left", "right"]',
     "contact.box": "box = [[0, 0.09], [0.06, 0.12]]",
     "motion.target": "target = [0.3, 0.2]",
+    "obstacle": 'obstacle = [{ kind = "halfspace", normal = [0, 1], offset = -0.05 }]',
     "control.outputs": 'outputs = [{ kind = "node", point = [0.03, 0] }]',
 }
 
@@ -64,12 +66,27 @@ def find_scene(path: str | Path) -> Path:
     return shipped_scenes().get(file.name, file) if bare else file
 
 
-def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
+def as_overrides(tables: Mapping[str, Any], above: str = "") -> list[str]:
+    """Tables by sections as "section.key=value" each, with values in TOML; an empty table is a value."""
+    result = []
+    for name, value in tables.items():
+        key = f"{above}{name}"
+        if isinstance(value, Mapping) and value:
+            result += as_overrides(value, f"{key}.")
+        elif isinstance(value, Mapping):
+            result.append(f"{key}={{}}")
+        else:
+            result.append(f"{key}={toml_value(value.tolist() if hasattr(value, 'tolist') else value)}")
+    return result
+
+
+def load_scene(path: str | Path, overrides: Sequence[str] = (), **tables: Any) -> Scene:
     """Read and validate a scene file, without MPI; under MPI use :func:`load_scene_collective`.
 
     Args:
         overrides: each ``a.b.c=value`` with a TOML value, as after ``--set``; a bare word is a string, and ``false``
             switches off an optional table.
+        tables: the same by sections, ``tissue={"cells": [4, 8]}``.
 
     Raises:
         SceneError: the file is missing, no TOML, or a key is unknown, missing, ill-typed or meaningless.
@@ -77,10 +94,12 @@ def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
     >>> import softgrasp as sg
     >>> sg.load_scene("paper_lqr", ["control.R=2"]).control.R
     2.0
+    >>> sg.load_scene("paper_lqr", control={"R": 3}).control.R
+    3.0
     """
     file = find_scene(path)
     data = _read(file)
-    for override in overrides:
+    for override in (*overrides, *as_overrides(tables)):
         _apply(data, override)
     try:
         check_values(data)
@@ -106,6 +125,7 @@ def resolved_toml(scene: Scene) -> str:
     for section, key in _FILES:
         if key in data[section]:
             data[section][key] = str(scene.path(data[section][key]))
+    replace_paths(data, lambda name: str(scene.path(name)))
     lines = [f"{key} = {toml_value(value)}" for key, value in data.items() if not isinstance(value, dict)]
     for section, table in data.items():
         if isinstance(table, dict):
@@ -307,7 +327,7 @@ def toml_value(value: Any) -> str:
     if isinstance(value, dict):
         inner = ", ".join(f"{_key(key)} = {toml_value(item)}" for key, item in value.items())
         return f"{{ {inner} }}" if inner else "{}"
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return "[" + ", ".join(toml_value(item) for item in value) + "]"
     if isinstance(value, bool):
         return "true" if value else "false"

@@ -16,11 +16,13 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, PrivateAttr, model_validator
 
 from softgrasp.fem.scene.control import BASES, Control, ControlOutput, Loop, Reduction, Study
+from softgrasp.fem.scene.obstacles import Obstacle, check_obstacle_vectors, check_obstacles
 from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, NonNegative, Positive, Section, Tissue
+from softgrasp.fem.shown import Card, Shown, brief, listed
 
 __all__ = [
     "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Loop", "Material",
-    "Motion", "Output", "Reduction", "Scene", "Study", "Time", "Tissue", "check_dimension", "scene_schema",
+    "Motion", "Obstacle", "Output", "Reduction", "Scene", "Study", "Time", "Tissue", "check_dimension", "scene_schema",
 ]  # fmt: skip
 
 
@@ -156,7 +158,7 @@ class Output(Section):
     )
 
 
-class Scene(Section):
+class Scene(Shown, Section):
     """A whole scene; relative file names start in `directory`.
 
     >>> import softgrasp as sg
@@ -180,6 +182,8 @@ class Scene(Section):
     """effects that are switched on [various]"""
     motion: Motion = Field(default_factory=lambda: Motion(profile="hold"))
     """motion of the hand, or force on it [m, rad, s]"""
+    obstacle: Dropped[Annotated[list[Obstacle], Field(min_length=1)]] = Field(None)
+    """rigid obstacles, a table each [m]; none unless given"""
     time: Time
     """time grid and solver [s]"""
     control: Dropped[Control] = Field(None)
@@ -192,6 +196,21 @@ class Scene(Section):
     """results that are kept [no unit]"""
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
     _mesh_digest: str = PrivateAttr("")  # of the mesh file, once it was read
+
+    def card(self) -> Card:
+        """Purpose, body, effects, motion and steps."""
+        tissue, on = self.tissue, [name for name, value in self.effects if value not in (None, False)]
+        body = (
+            tissue.mesh
+            or f"{listed(f'{x:g} m' for x in tissue.size or ())}, cells {listed(map(str, tissue.cells or ()))}"
+        )
+        rows = (
+            ("purpose", brief(self.description)),
+            ("body", f"{body}, P{tissue.order}"),
+            ("effects", listed(on)),
+            ("motion", f"{self.motion.profile}, {self.time.steps} steps to {self.time_end:g} s"),
+        )
+        return Card(f"Scene {self.name}", rows)
 
     @property
     def directory(self) -> Path:
@@ -220,6 +239,12 @@ class Scene(Section):
         """A file named in the scene, absolute."""
         return (self._directory / name).resolve()
 
+    @property
+    def files(self) -> list[Path]:
+        """Files that the scene names, absolute."""
+        paths = [obstacle.path.csv for obstacle in self.obstacle or [] if obstacle.path is not None]
+        return [self.path(name) for name in (self.tissue.mesh, self.motion.csv, *paths) if name is not None]
+
     @model_validator(mode="after")
     def _check(self) -> Scene:
         effects = self.effects
@@ -237,6 +262,7 @@ class Scene(Section):
         for name, layer in self.tissue.layers.items():
             if layer.beta is not None and effects.damping is None:
                 raise ValueError(f"tissue.layers.{name}.beta needs effects.damping; give it or drop beta")
+        check_obstacles(self.obstacle, used=False)
         if self.dimension is not None:
             _check_vectors(self, self.dimension)
         return self
@@ -262,6 +288,7 @@ def _check_vectors(scene: Scene, d: int) -> None:
     for key, vector, length in vectors:
         if vector is not None and len(vector) != length:
             raise ValueError(f"{key} has a vector of {len(vector)} entries; it must have {length} in this {d}D scene")
+    check_obstacle_vectors(scene.obstacle, d)
     scene.contact.axes(d)
     if d == 2 and isinstance(scene.hand.inertia, list):
         raise ValueError("hand.inertia is a list; in 2D it must be one number")

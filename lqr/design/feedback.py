@@ -10,7 +10,8 @@ from typing import cast
 import numpy as np
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.fem.model.build import Model, Stopwatch, checked_model
+from softgrasp.fem.shown import Card, Shown, amount, listed
 from softgrasp.lqr.design.scene import actuation, control_of, problem, sampling, scene_target
 from softgrasp.lqr.diagnosis import Diagnosis, diagnose
 from softgrasp.lqr.loop.actuation import Actuation
@@ -29,8 +30,8 @@ MODAL_CANDIDATES = 40
 ROUNDING = 1e-8  # of an eigenvalue on the unit circle
 
 
-@dataclass(frozen=True)
-class Design:
+@dataclass(frozen=True, repr=False)
+class Design(Shown):
     """The optimal feedback of a scene."""
 
     model: Model
@@ -53,6 +54,18 @@ class Design:
     """Closed loop of the full plant under the optimal gain."""
     modal: bool
     """Whether the gain controls the lowest modes only."""
+
+    def card(self) -> Card:
+        """Plant, solver and the closed loop of the full plant."""
+        solution = self.solution
+        rows = (
+            ("plant", f"{self.model.states} states, outputs {listed(self.problem.names)}"),
+            ("solver", f"{solution.method}, rank {solution.rank}"),
+            ("residual", amount(solution.residual)),
+            ("abscissa", amount(self.quality.abscissa, "1/s")),
+            ("warnings", str(len(self.diagnosis.findings))),
+        )
+        return Card(f"Design {self.model.scene.name}", rows)
 
     @property
     def gain(self) -> Gain:
@@ -104,7 +117,7 @@ def design(
     >>> sg.design(sg.build("paper_lqr", ["tissue.cells=[2, 4]"])).quality.stable
     True
     """
-    watch = watch or Stopwatch(model.system.layout.comm)
+    watch = watch or Stopwatch(checked_model(model).system.layout.comm)
     with watch.stage("diagnosis"):
         plant, diagnosis, modal = check(model)
         target = hand_target(plant, scene_target(model))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.build import Model, checked_model
 from softgrasp.fem.model.outputs import make_outputs, output_columns
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import motion_table
@@ -48,6 +48,7 @@ def problem(model: Model) -> RiccatiProblem:
     >>> problem.names
     ('tip_x', 'tip_y')
     """
+    model = checked_model(model)
     scene, system = model.scene, model.system
     outputs = make_outputs(scene, system)
     C_z = output_columns(outputs, system.layout.n_local)

@@ -16,6 +16,8 @@ from softgrasp.fem.errors import no_pipe, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.reduced import midpoint_map
+from softgrasp.fem.shown import Card, Shown, amount, counted, listed
 from softgrasp.lqr.loop.small import SmallPlant
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
@@ -45,8 +47,8 @@ def _sorted(layout: BlockLayout) -> tuple[NDArray[np.int64], str] | None:
     return np.asarray((order[:, None] * d + np.arange(d)).ravel()), digest.hexdigest()
 
 
-@dataclass
-class Controller:
+@dataclass(repr=False)
+class Controller(Shown):
     """u = clip(u_bar + K (x - x_bar)) for x = [q_s, v_s, eta, eta'], with eta = W'z a few numbers of the tissue.
 
     A robot measures its hand, not the tissue. ``step`` therefore carries eta itself, without an observer: the tissue
@@ -84,6 +86,16 @@ class Controller:
     """Digest of the mesh's free nodes; empty when unknown."""
     about: dict[str, Any] = field(default_factory=dict)
     """Method, weights and output names, as free text."""
+
+    def card(self) -> Card:
+        """Dimension, rate, limits and target."""
+        rows = (
+            ("dimension", f"N = {self.plant.N}, {counted(len(self.u_bar), 'input')}"),
+            ("rate", f"{1 / self.period:.4g} Hz"),
+            ("limits", "none" if self.limits is None else listed(amount(x) for x in self.limits)),
+            ("hand at rest", listed(amount(x) for x in self.x_bar[: len(self.u_bar)])),
+        )
+        return Card("Controller u = u_bar + K (x - x_bar)", rows)
 
     def __post_init__(self) -> None:
         n_s, N = self.plant.B.shape[1], self.plant.N
@@ -184,10 +196,10 @@ def _tissue_step(plant: SmallPlant, period: float) -> tuple[Array, Array, Array 
     """
     n_s = plant.B.shape[1]
     e, v = slice(2 * n_s, None), slice(n_s, 2 * n_s)
-    left, right = plant.E[e, e] - period / 2 * plant.A[e, e], plant.E[e, e] + period / 2 * plant.A[e, e]
-    columns = np.hstack([right, -plant.E[e, v], period / 2 * plant.A[e, v], period * plant.f[e, None]])
-    k = len(left)
-    parts = np.split(np.linalg.solve(left, columns), [k, k + n_s, k + 2 * n_s], axis=1)
+    loads = np.hstack([-plant.E[e, v] / period, plant.A[e, v] / 2, plant.f[e, None]])
+    k = len(loads)
+    moved = midpoint_map(plant.E[e, e], plant.A[e, e], loads, period)
+    parts = np.split(moved, [k, k + n_s, k + 2 * n_s], axis=1)
     step, accelerated, dragged, constant = (np.ascontiguousarray(part) for part in parts)
     return step, accelerated, dragged if plant.A[e, v].any() else None, constant[:, 0].copy()
 

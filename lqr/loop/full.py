@@ -13,11 +13,13 @@ from mpi4py import MPI
 
 from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.errors import SolverError
+from softgrasp.fem.labelled import Labelled, Quantity, of_columns, of_hand
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.snapshots import Snapshots, make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
+from softgrasp.fem.shown import Card, Shown, amount, counted, listed
 from softgrasp.fem.solve.solvers import Reproducible, SolverUsed, choose_solver
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import accumulated_cost
@@ -47,8 +49,8 @@ class LoopOptions:
     most: float = np.inf  # cost J at which the run stops as divergent
 
 
-@dataclass(frozen=True)
-class LoopTrajectory:
+@dataclass(frozen=True, repr=False)
+class LoopTrajectory(Shown, Labelled):
     """Result of a closed-loop run; small arrays are on every rank."""
 
     times: Array
@@ -81,6 +83,33 @@ class LoopTrajectory:
     """Time of "factor" (with the responses) and "steps" on the slowest rank [s]."""
     newton: NewtonFigures | None = None
     """Convergence of the steps of finite strain; None where the steps are linear."""
+
+    def card(self) -> Card:
+        """Steps, cost, where the hand ends, saturation."""
+        rows = (
+            ("time", f"{counted(len(self.times) - 1, 'step')} to {amount(self.times[-1], 's')}"),
+            ("outputs", listed(self.output_names)),
+            ("cost", amount(self.cost[-1])),
+            ("hand at the end", listed(amount(x) for x in self.q_s[-1])),
+            ("steps at a limit", f"{100 * self.saturated:.3g} %"),
+        )
+        return Card("Trajectory of the closed loop", rows)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Outputs, hand and input over time with their labels and units."""
+        return {
+            "outputs": of_columns(self.outputs, self.columns, "output"),
+            "outputs_rigid": of_columns(self.outputs_rigid, self.columns, "output"),
+            "q_s": of_hand(self.q_s, self.output_names),
+            "v_s": of_hand(self.v_s, self.output_names, rate="/s"),
+            "inputs": of_hand(self.inputs, self.output_names, load=True),
+        }
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Cost and share of the steps with an input at its limit."""
+        return {"cost": float(self.cost[-1]), "saturated": self.saturated}
 
     @property
     def output_names(self) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import Card, Shown
 from softgrasp.lqr.loop.controller import Controller
 from softgrasp.reduction.lti import LTI
 
@@ -36,14 +37,23 @@ class AxisMargins:
     delay: float  # delay margin [s]
 
 
-@dataclass(frozen=True)
-class LoopMargins:
+@dataclass(frozen=True, repr=False)
+class LoopMargins(Shown):
     """Frequency response of a loop and its margins."""
 
     omega: Array  # frequencies up to the Nyquist frequency of the ticks [rad/s], (F,)
     response: np.ndarray  # frequency response l_i of the loop at each input, (F, n_s)
     axes: tuple[AxisMargins, ...]  # margins at each input, n_s
     distance: float  # smallest singular value of I + L over all frequencies, at most 1 of use
+
+    def card(self) -> Card:
+        """Gain, phase and delay that each input withstands, and all at once."""
+        low, high, phase = self.together
+        rows = [
+            (a.name, f"gain {a.gain_down:.3g} to {a.gain_up:.3g}, phase {a.phase:.3g} deg, delay {a.delay:.3g} s")
+            for a in self.axes
+        ]
+        return Card("LoopMargins", (*rows, ("all at once", f"gain {low:.3g} to {high:.3g}, phase {phase:.3g} deg")))
 
     @property
     def together(self) -> tuple[float, float, float]:

@@ -8,11 +8,12 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.shown import Shown
 from softgrasp.lqr.plant.block import Block
 
 
-@dataclass(frozen=True)
-class PlantState:
+@dataclass(frozen=True, repr=False)
+class PlantState(Shown):
     """x = [q_s, v_s, z, v_z] with z = q_e - T q_s."""
 
     q_s: Array  # displacement of the hand on every rank [m, rad], (n_s,)
@@ -29,8 +30,8 @@ class PlantState:
         return Block.of_parts(*(part[:, None] for part in (self.q_s, self.v_s, self.z, self.v_z)))
 
 
-@dataclass(frozen=True)
-class Gain:
+@dataclass(frozen=True, repr=False)
+class Gain(Shown):
     """u = K x = K_s [q_s; v_s] + K_z' z + K_v' v_z."""
 
     K_s: Array  # gain on the hand, on every rank [N/m, N s/m; N m for torques], (n_s, 2 n_s)

@@ -10,6 +10,7 @@ import numpy as np
 from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import Card, Shown, amount, listed
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain
@@ -17,8 +18,8 @@ from softgrasp.lqr.plant.gain import Gain
 SolverName = Literal["dense", "newton_adi", "radi", "galerkin", "modal_lqr"]
 
 
-@dataclass(frozen=True)
-class RiccatiProblem:
+@dataclass(frozen=True, repr=False)
+class RiccatiProblem(Shown):
     """A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = 0 with x = [q_s, v_s, z, v_z], z = q_e - T q_s.
 
     In these coordinates (one-way; [...] two-way only)
@@ -39,6 +40,16 @@ class RiccatiProblem:
     columns: Columns = ()  # label and unit of each output, p or none
     # forces of the inputs on the tissue, local rows (n_local, m), when there is no hand; else None
     B_z: Array | None = None
+
+    def card(self) -> Card:
+        """Size, inputs, outputs and weights."""
+        rows = (
+            ("states", str(self.layout.states)),
+            ("inputs", str(self.inputs)),
+            ("outputs", listed(self.names)),
+            ("weights", f"Q up to {amount(np.abs(self.Q).max())}, R up to {amount(np.abs(self.R).max())}"),
+        )
+        return Card("RiccatiProblem A'XE + E'XA - E'XB R^-1 B'XE + C'QC = 0", rows)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -61,8 +72,8 @@ class RiccatiProblem:
         return self.system.M_hand + (self.system.M_rigid if self.system.two_way else 0.0)
 
 
-@dataclass(frozen=True)
-class RiccatiSolution:
+@dataclass(frozen=True, repr=False)
+class RiccatiSolution(Shown):
     """X ~ Z Z' and the feedback u = K x, in the hand-relative coordinates of :class:`RiccatiProblem`."""
 
     factor: Block
@@ -83,6 +94,11 @@ class RiccatiSolution:
     """Numbers of "newton_steps", "adi_steps" and tissue "solves"."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time by stage [s]."""
+
+    def card(self) -> Card:
+        """Solver, rank and residual."""
+        rows = (("solver", self.method), ("rank", str(self.rank)), ("residual", amount(self.residual)))
+        return Card("RiccatiSolution X = Z Z'", rows)
 
     @property
     def rank(self) -> int:

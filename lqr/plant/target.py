@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.shown import Shown
 from softgrasp.fem.solve.statics import equilibrium
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.plant.checks import ControlError
@@ -21,8 +22,8 @@ from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 
-@dataclass(frozen=True)
-class Target:
+@dataclass(frozen=True, repr=False)
+class Target(Shown):
     """State, input and outputs at rest."""
 
     state: PlantState  # state x_bar at rest

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from softgrasp.fem.petsc import Array, on_root
+from softgrasp.fem.reduced import midpoint_map
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.lqr.spectrum.sampled import Sampling
@@ -54,9 +55,9 @@ def modal_excess(
 def _march(loop: ModalLoop, k: Array, k_best: Array, X: Array, law: Sampling, steps: int) -> Array:
     """All loops side by side, (2 n_s + 2 modes, gains)."""
     n, m = loop.B.shape
-    solved = np.linalg.solve(np.eye(n) - law.dt / 2 * loop.A, np.hstack([np.eye(n), law.dt / 2 * loop.B]))
-    P, Y, R = solved[:, :n], solved[:, n:], loop.problem.R
-    implicit = np.linalg.solve(np.eye(m) - k @ Y, k @ P)
+    P, Y = np.split(midpoint_map(np.eye(n), loop.A, loop.B, law.dt), [n], axis=1)
+    R = loop.problem.R
+    implicit = np.linalg.solve(np.eye(m) - k @ Y / 2, k @ (P + np.eye(n)) / 2)
     waiting = deque([np.zeros((m, len(k)))] * (law.delay + 1), law.delay + 1)
     cost = np.zeros(len(k))
     for n_step in range(steps):
@@ -65,8 +66,8 @@ def _march(loop: ModalLoop, k: Array, k_best: Array, X: Array, law: Sampling, st
         elif n_step % law.every == 0:
             waiting.append(np.einsum("gij,jg->ig", k, X))
         u = waiting[0]
-        middle = P @ X + Y @ u
-        off = u - k_best @ middle
+        new = P @ X + Y @ u
+        off = u - k_best @ (X + new) / 2
         cost += law.dt * np.einsum("ig,ij,jg->g", off, R, off)
-        X = 2 * middle - X
+        X = new
     return cost

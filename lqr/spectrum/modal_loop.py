@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array, on_root, total
+from softgrasp.fem.shown import Shown
 from softgrasp.lqr.dense.care import block_eigenvalues, lyapunov
 from softgrasp.lqr.dense.modal import ModalPlant, TissueMatrices, dense_modes, gather_tissue, lowest_plant
 from softgrasp.lqr.plant.block import Block
@@ -34,8 +35,8 @@ class SampledRadius:
         return self.certified and self.value < 1
 
 
-@dataclass(frozen=True)
-class LoopQuality:
+@dataclass(frozen=True, repr=False)
+class LoopQuality(Shown):
     """The full plant under one gain."""
 
     abscissa: float  # largest real part of the closed-loop spectrum, or a lower bound where not ``exact`` [1/s]

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from softgrasp.fem.petsc import Array, on_root
+from softgrasp.fem.reduced import midpoint_map
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.controller import Controller
 from softgrasp.lqr.lowrank.shifts import frequency_estimate
@@ -85,10 +86,8 @@ def tick(A: Array, B: Array, law: Sampling) -> tuple[Array, Array]:
     Phi = (I - dt/2 A)^{-1} (I + dt/2 A), Gamma = dt (I - dt/2 A)^{-1} B.
     """
     n, m = B.shape[-2:]
-    one = np.eye(n)
-    solved = np.linalg.solve(one - law.dt / 2 * A, np.concatenate([one + law.dt / 2 * A, law.dt * B], axis=-1))
     step = np.zeros((*A.shape[:-2], n + m, n + m))
-    step[..., :n, :] = solved
+    step[..., :n, :] = midpoint_map(np.eye(n), A, B, law.dt)
     step[..., n:, n:] = np.eye(m)
     moved = np.linalg.matrix_power(step, law.every)
     return moved[..., :n, :n], moved[..., :n, n:]
@@ -282,9 +281,7 @@ def _responses(rest: _Rest, law: Sampling) -> tuple[float, float]:
     A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = omega, -omega, -twice
     B = np.zeros((len(omega), 2, 1))
     B[:, 1] = 1.0
-    one = np.eye(2)
-    push = np.linalg.solve(one - law.dt / 2 * A, law.dt * B)[..., 0]
-    inner = np.linalg.solve(one - law.dt / 2 * A, np.broadcast_to(one, A.shape)) * 2 - one
+    inner, push = np.split(midpoint_map(np.eye(2), A, B, law.dt), [2], axis=-1)
     M, b = tick(A, B, law)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         values, vectors = np.linalg.eig(inner)
@@ -298,7 +295,7 @@ def _responses(rest: _Rest, law: Sampling) -> tuple[float, float]:
         det = p * s - q * r
         split = np.abs((s * b_1 - q * b_2) / det) / gap[:, 0] + np.abs((p * b_2 - r * b_1) / det) / gap[:, 1]
         constant = np.fmin(size * resolvent, split)
-        ramp = law.every * np.linalg.norm(push, axis=1) * resolvent
+        ramp = law.every * np.linalg.norm(push[..., 0], axis=1) * resolvent
     fine = (gap > 0).all(axis=1)
     return tuple(float(np.max(np.where(fine & np.isfinite(x), x, np.inf))) for x in (constant, ramp))  # type: ignore[return-value]
 

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import Card, Shown, listed
 from softgrasp.reduction.certified import bounds
 from softgrasp.reduction.certified.certificate import (
     Bound,
@@ -53,8 +54,8 @@ class ParameterDomain:
     independent_layers: bool = False  # every layer varies by itself within these factors; else all keep their ratios
 
 
-@dataclass(frozen=True)
-class CertifiedModel:
+@dataclass(frozen=True, repr=False)
+class CertifiedModel(Shown):
     """A reduced model with everything that a certified run needs; small arrays, equal on every rank. Not collective.
 
     Attributes:
@@ -95,6 +96,21 @@ class CertifiedModel:
             raise ModelError(f"k = {self.k} of {k2} modes; only second-order bases have leading ones", fine.name)
         if self.certify != "proof" and self.k == k2:
             object.__setattr__(self, "certify", "proof")
+
+    def card(self) -> Card:
+        """Modes, box of the materials, tolerance and how it is certified."""
+        box, tolerance = self.box, self.tolerance
+        trained = "nowhere"
+        if box is not None:
+            trained = f"lambda {box.lam[0]:g} to {box.lam[1]:g} Pa, mu {box.mu[0]:g} to {box.mu[1]:g} Pa"
+        rows = (
+            ("modes", f"{self.k}, checked by {self.k2}"),
+            ("trained for", trained),
+            ("tolerance", "none" if tolerance is None else f"{100 * tolerance:g} % in the {self.norm} norm"),
+            ("certificate", {"two": "proof, two bases", "proof": "proof", "estimate": "estimate"}[self.certify]),
+            ("outputs", listed(self.fine.outputs.names)),
+        )
+        return Card(f"CertifiedModel {self.fine.name}", rows)
 
     @property
     def k2(self) -> int:

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.material import LayerMaterial
+from softgrasp.fem.material import LayerMaterial, in_words
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import Card, Shown, listed
 from softgrasp.reduction.model import ModelError, Outputs
 from softgrasp.reduction.online import ReducedTrajectory, checked_hand
 from softgrasp.reduction.strain.cells import Cells, Potential
@@ -73,7 +74,7 @@ class TrainingDomain:
         return f"the run takes coordinate {i + 1} to {ratio[i]:.2g} times what the training runs reached"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class StrainRun(ReducedTrajectory):
     """A reduced run at finite strain, x = [q_s, v_s, a, a']."""
 
@@ -128,8 +129,8 @@ def coordinates(run: ReducedTrajectory) -> tuple[Array, Array]:
     return a, v
 
 
-@dataclass(frozen=True)
-class ReducedStrainSystem:
+@dataclass(frozen=True, repr=False)
+class ReducedStrainSystem(Shown):
     """A model at one parameter and one time step, everything made that a run needs."""
 
     model: StrainModel  # it comes from
@@ -213,8 +214,8 @@ def refuse(reason: str, outside: bool) -> None:
         raise ModelError(f"{reason}; train the model there, or allow it with outside=True and check the result")
 
 
-@dataclass(frozen=True)
-class StrainModel:
+@dataclass(frozen=True, repr=False)
+class StrainModel(Shown):
     """Reduced model of tissue at finite strain for all lambda and mu of its training box."""
 
     cells: Cells  # sampled cells, in reduced coordinates
@@ -237,6 +238,16 @@ class StrainModel:
     origin: dict[str, Any] = field(default_factory=dict)  # of `reduction.origin`, what that scene says of a run; or {}
     finer: Finer | None = None  # space in which its answers are checked; None leaves them without an estimate
     seconds: dict[str, float] = field(default_factory=dict)  # offline time by stage [s]
+
+    def card(self) -> Card:
+        """Dimension, cells, materials and outputs."""
+        rows = (
+            ("dimension", f"N = {self.N}"),
+            ("cells", f"{self.cells.count} of {self.cells_full}"),
+            ("material", in_words(self.materials)),
+            ("outputs", listed(self.outputs.names)),
+        )
+        return Card("StrainModel, finite strain", rows)
 
     @property
     def k(self) -> int:

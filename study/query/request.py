@@ -15,7 +15,8 @@ import numpy as np
 from softgrasp.fem.errors import SceneError, shortened
 from softgrasp.fem.model.memory import size_text
 from softgrasp.fem.resources import free_memory
-from softgrasp.fem.run.motion import Profile, read_csv
+from softgrasp.fem.run.motion import Profile
+from softgrasp.fem.scene.table import read_csv
 from softgrasp.fem.scene.text import out_of_range, read_text
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.motion import FINER, Drive, Materials

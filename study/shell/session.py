@@ -76,8 +76,8 @@ class Session:
         scene = load_scene_collective(self.comm, self.path, self.overrides)
         with raise_on_all_ranks(self.comm):
             if writes and self.comm.rank == 0:
-                named = [scene.path(file) for file in (scene.tissue.mesh, scene.motion.csv) if file is not None]
-                claim(self.out, self.command, scene.name, inputs=[find_scene(self.path), *named], empty=self.empty)
+                inputs = [find_scene(self.path), *scene.files]
+                claim(self.out, self.command, scene.name, inputs=inputs, empty=self.empty)
         if writes:
             follow(self.out)
         described = f": {escape(scene.description)}" if scene.description else ""

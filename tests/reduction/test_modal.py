@@ -17,7 +17,7 @@ from softgrasp.reduction.bases.states import states_of
 from softgrasp.reduction.model import ModelError, ReducedSystem
 from softgrasp.reduction.online import run, run_batch
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.propagator import march, propagator, turns
+from softgrasp.reduction.propagator import propagator, turns
 from tests.helpers.models import Array, close, make_scene
 from tests.helpers.reduced import DAMPED, KINDS, TINY, model_of, reduced, small_of, step_of, symplectic_basis, wiggle
 
@@ -60,8 +60,8 @@ def test_modes_follow_the_plain_rule(comm: MPI.Intracomm, kind: tuple[Any, ...],
         step, u = propagator(small, dt), wiggle(steps, dt)
         assert step.modal is not None
         start = step.at.X_inverse @ x0
-        blocks = march(replace(step, modal=None), u, start)
-        assert close(march(step, u, start), blocks) < 1e-10  # as above
+        blocks = replace(step, modal=None).march(u, start)
+        assert close(step.march(u, start), blocks) < 1e-10  # as above
 
 
 def test_turns_are_those_of_the_angles() -> None:

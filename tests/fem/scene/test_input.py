@@ -12,8 +12,8 @@ import pytest
 
 from softgrasp.fem.errors import LONGEST, SceneError, SoftgraspError
 from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.run.motion import read_csv
 from softgrasp.fem.scene.file import load_scene, resolved_toml, shipped_scenes
+from softgrasp.fem.scene.table import read_csv
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 PAPER = shipped_scenes()["paper_forward"]

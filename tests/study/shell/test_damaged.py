@@ -26,8 +26,8 @@ import softgrasp as sg
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.mesh.file import load_arrays
 from softgrasp.fem.owned import LIST, LOCK, hold, own_files, release
-from softgrasp.fem.run.motion import read_csv
 from softgrasp.fem.run.simulate import RunOptions
+from softgrasp.fem.scene.table import read_csv
 from softgrasp.reduction.archive import save
 from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.study.precision.cache import Cache

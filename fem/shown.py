@@ -1,0 +1,81 @@
+"""How an object shows itself: a title and a few named values, as text and as a table in a notebook."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from types import FunctionType
+from typing import Any
+
+import numpy as np
+
+MOST_LAYERS = 3  # materials that are shown one by one
+
+
+@dataclass(frozen=True)
+class Card:
+    """What is shown of an object."""
+
+    title: str  # kind and name of the object
+    rows: tuple[tuple[str, str], ...]  # name and value of each line
+
+    def text(self) -> str:
+        """Title and lines, the values in one column."""
+        width = max((len(name) for name, _ in self.rows), default=0)
+        return "\n".join([self.title, *(f"  {name:<{width}}  {value}" for name, value in self.rows)])
+
+    def html(self) -> str:
+        """A small table with its title above."""
+        cells = "".join(
+            f'<tr><th style="text-align:left">{html.escape(name)}</th>'
+            f'<td style="text-align:left">{html.escape(value)}</td></tr>'
+            for name, value in self.rows
+        )
+        return f"<div><strong>{html.escape(self.title)}</strong><table>{cells}</table></div>"
+
+
+class Shown:
+    """An object with a :class:`Card`, which ``print`` and notebooks show. Neither is collective."""
+
+    __slots__ = ()
+
+    def card(self) -> Card:
+        """Title and lines; without one of its own a data class names its fields, arrays by shape. Not collective."""
+        rows = ((entry.name, brief(getattr(self, entry.name))) for entry in fields(self) if entry.repr)  # type: ignore[arg-type]
+        return Card(type(self).__name__, tuple(rows))
+
+    def __repr__(self) -> str:
+        return self.card().text()
+
+    def _repr_html_(self) -> str:
+        return self.card().html()
+
+
+def brief(value: Any) -> str:
+    """A value within some forty letters: an array by its shape, an object by its class."""
+    if isinstance(value, np.ndarray):
+        return f"array {value.shape}"
+    if isinstance(value, str | bool | int | float | complex | FunctionType | None):
+        text = getattr(value, "__name__", None) or (f"{value:.4g}" if isinstance(value, float) else str(value))
+        return text if len(text) <= 40 else text[:37] + "..."
+    if isinstance(value, tuple | list | dict):
+        return counted(len(value), "entry", "entries")
+    return type(value).__name__
+
+
+def amount(value: float, unit: str = "") -> str:
+    """A number of three digits with its unit: "0.0123 m"."""
+    return f"{value:.3g} {unit}".rstrip()
+
+
+def counted(number: int, one: str, many: str = "") -> str:
+    """A number of things: "1 step", "600 steps"."""
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+def listed(names: Iterable[str], most: int = 6) -> str:
+    """Names in a row, no more than ``most`` of them: "tip_x, tip_y, 4 more"; "none" without any."""
+    names = tuple(names)
+    shown = names if len(names) <= most else (*names[: most - 1], f"{len(names) - most + 1} more")
+    return ", ".join(shown) or "none"

@@ -1,0 +1,118 @@
+"""What users meet in a notebook: objects that show themselves, labelled data, names, keyword tables."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+import softgrasp as sg
+from softgrasp.fem.errors import SceneError, SoftgraspError
+from softgrasp.fem.shown import Shown
+from softgrasp.lqr.loop.margins import loop_margins
+
+pytestmark = pytest.mark.serial
+SMALL: dict[str, Any] = {"tissue": {"cells": [4, 8]}}
+LONGEST = 1000  # letters of what an object prints
+
+
+@pytest.fixture(scope="module")
+def objects() -> dict[str, Any]:
+    """One of each class that `import softgrasp` returns, of a small scene."""
+    model = sg.build("paper_lqr", **SMALL, time={"steps": 300})
+    run = sg.simulate(model)
+    rom = sg.reduce(model, run, "psd_fixed", N=14)
+    design = sg.design(model)
+    controller = sg.make_controller(design, order=8)
+    loop = sg.ClosedLoop(design.problem, dt=0.5).run(design.gain, target=[5.0, 3.0], steps=60)
+    strained = sg.build("paper_forward", **SMALL, time={"steps": 100}, effects={"finite_strain": {}})
+    strained_run = sg.simulate(strained)
+    strain_model = sg.reduce(strained, strained_run, N=14)
+    return {
+        "scene": model.scene, "model": model, "run": run, "rom": rom, "system": rom.at(), "lti": rom.lti(),
+        "replay": sg.replay(rom, model, run), "design": design, "controller": controller,
+        "margins": loop_margins(controller), "problem": design.problem, "solution": design.solution, "loop": loop,
+        "strained_run": strained_run, "strain_model": strain_model,
+        "strain_replay": sg.replay(strain_model, strained, strained_run),
+    }  # fmt: skip
+
+
+def inside(value: Any, depth: int = 2) -> list[Any]:
+    """An object and the data classes that it holds, which users print next."""
+    if not is_dataclass(value) or depth == 0:
+        return []
+    return [value, *(part for f in fields(value) for part in inside(getattr(value, f.name), depth - 1))]
+
+
+def test_no_object_prints_more_than_a_screen(objects: dict[str, Any]) -> None:
+    shown = [part for value in objects.values() for part in (inside(value) or [value]) if isinstance(part, Shown)]
+    assert {type(value).__name__ for value in objects.values()} <= {type(part).__name__ for part in shown}
+    longest = max(shown, key=lambda part: len(repr(part)))
+    assert len(repr(longest)) <= LONGEST, repr(longest)
+    for part in shown:
+        assert part._repr_html_().count("<tr>") == len(part.card().rows)
+
+
+def test_cards_hold_the_numbers_of_the_objects(objects: dict[str, Any]) -> None:
+    rows = dict(objects["model"].card().rows)
+    assert rows["unknowns"] == f"hand 2, tissue {objects['model'].system.layout.n_e}, {objects['model'].states} states"
+    assert rows["effects"] == "damping"
+    assert "2D, P1, 64 cells" in repr(objects["model"])  # 4 x 8 boxes of two triangles
+    poles = np.linalg.eigvals(np.linalg.solve(objects["lti"].E, objects["lti"].A)[4:, 4:])  # without the free hand
+    assert f"spectral abscissa {poles.real.max():.3g} 1/s" in repr(objects["system"])
+
+
+def test_units_and_labels_of_a_run(objects: dict[str, Any]) -> None:
+    pytest.importorskip("xarray")
+    run, loop = objects["run"], objects["loop"]
+    data = run.to_xarray()
+    assert dict(data.sizes) == {"time": 301, "output": 2, "hand": 2, "midpoint": 300}
+    assert data.outputs.attrs["units"] == "m"
+    assert data.force.attrs["units"] == "N"
+    np.testing.assert_array_equal(data.outputs.sel(output="tip_y"), run.outputs[:, 1])
+    np.testing.assert_array_equal(data.midpoint, run.times[:-1] + run.times[1] / 2)
+    table = loop.to_pandas()
+    np.testing.assert_array_equal(table["inputs y [N]"][1:], loop.inputs[:, 1])
+    assert np.isnan(table["inputs y [N]"].iloc[0])
+    assert objects["replay"].to_xarray().outputs.shape == (301, 2)
+    assert objects["strain_replay"].to_pandas().index.name == "time [s]"
+
+
+def test_tables_of_keys_are_overrides() -> None:
+    kept = {"tissue": {"cells": (4, 8), "material": {"young": 1e3}}, "effects": {"finite_strain": {}}}
+    given = ["tissue.cells=[4, 8]", "tissue.material={young=1e3, poisson=0.3, rho=1}", "effects.finite_strain={}"]
+    kept["tissue"]["material"] |= {"poisson": 0.3, "rho": 1}  # type: ignore[operator]
+    with pytest.raises(SceneError, match="young and poisson exclude lambda and mu"):  # the scene's own stay
+        sg.load_scene("paper_forward", **kept)
+    scene = sg.load_scene("paper_forward", given[:2], effects={"finite_strain": {}})
+    assert scene == sg.load_scene("paper_forward", given)
+    with pytest.raises(SceneError, match=r"tissue\.cels is not a key"):
+        sg.load_scene("paper_forward", tissue={"cels": [4, 8]})
+
+
+def test_young_and_poisson_are_lambda_and_mu(objects: dict[str, Any]) -> None:
+    model = objects["model"]
+    (material,) = model.with_materials(young=130.0, poisson=0.3).system.materials
+    assert material.lam == pytest.approx(75.0, rel=1e-14)  # E nu / ((1 + nu) (1 - 2 nu)), rounding
+    assert material.mu == pytest.approx(50.0, rel=1e-14)  # E / (2 (1 + nu)), rounding
+    for wrong in ({"young": 1.0}, {"young": 1.0, "poisson": 0.3, "mu": 2.0}, {"young": 1.0, "poisson": 0.5}):
+        with pytest.raises(SceneError, match="young"):
+            model.with_materials(**wrong)
+
+
+@pytest.mark.parametrize("call", [sg.simulate, sg.problem, sg.design])
+def test_a_name_where_a_model_is_needed_says_what_to_write(call: Any) -> None:
+    with pytest.raises(SceneError, match=r'write softgrasp\.build\("paper_forward"\)'):
+        call("paper_forward")
+
+
+def test_the_names_of_the_package_are_the_public_ones() -> None:
+    assert set(dir(sg)) == {*sg.__all__, "__version__"}
+
+
+def test_a_missing_package_is_named(objects: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "xarray", None)
+    with pytest.raises(SoftgraspError, match=r"xarray is not installed; `pip install 'softgrasp\[data\]'`"):
+        objects["run"].to_xarray()
