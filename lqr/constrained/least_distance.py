@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.plant.checks import ControlError
@@ -30,7 +31,7 @@ class Nearest:
 
 
 def nearest(G: Array, h: Array, start: Sequence[int] = (), limit: int = 10_000) -> Nearest:
-    """min |x|^2 / 2, G x <= h.
+    """The solution of min |x|^2 / 2, G x <= h.
 
     Every step adds the row that is violated most and drops those whose multipliers would become negative; |x| grows
     with every row that is added, so no set comes twice.
@@ -124,9 +125,9 @@ class SoftNearest:
 
 
 def nearest_soft(
-    G: Array, h: Array, group: Array, hard: tuple[Array, Array], penalty: float, limit: int = 10_000
+    G: Array, h: Array, group: NDArray[np.int64], hard: tuple[Array, Array], penalty: float, limit: int = 10_000
 ) -> SoftNearest:
-    """min |x|^2 / 2 + sum_i (penalty e_i + e_i^2 / 2), G x <= h + e of the row's group, e >= 0, and hard rows.
+    """The solution of min |x|^2 / 2 + sum_i (penalty e_i + e_i^2 / 2), G x <= h + e of the row's group, e >= 0.
 
     The penalty is exact: e = 0 wherever some x keeps all rows and the multipliers of each group add to less than it.
 

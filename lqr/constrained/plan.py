@@ -7,10 +7,11 @@ fall from round to round and every round is safe. Both sides of an obstacle on t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from softgrasp.fem.obstacles.shapes import HalfSpace, Shape
 from softgrasp.fem.petsc import Array
@@ -42,7 +43,7 @@ class Task:
     names: tuple[str, ...]  # of the obstacles
     error: Array  # bound on what the reduced plant leaves out at every node [m], (nodes, 2)
     clearance: float = 0.0  # distance to keep beyond that [m]
-    limits: Limits = Limits()  # of the hand
+    limits: Limits = field(default_factory=Limits)  # of the hand
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ class Plan:
 
     @property
     def inputs(self) -> Array:
-        """u of every interval [N], (H, n_s)."""
+        """Inputs u of every interval [N], (H, n_s)."""
         return self.horizon.input(self.task.start, self.c) + self.task.u_bar
 
     @property
@@ -114,7 +115,7 @@ class Plan:
 
 def places(horizon: Horizon, task: Task, c: Array) -> Array:
     """Nodes of the reduced plant at all instants of a plan [m], (H, parts + 1, nodes, 2)."""
-    return task.places + np.einsum("jdn,kin->kijd", horizon.plant.Y, horizon.state(task.start, c))
+    return np.asarray(task.places + np.einsum("jdn,kin->kijd", horizon.plant.Y, horizon.state(task.start, c)))
 
 
 def make_plan(plant: HeldPlant, task: Task, steps: int, notify: Callable[[int], None] | None = None) -> Plan:
@@ -195,7 +196,8 @@ def _normals(shape: Shape, body: Array) -> Array:
 def _rounds(horizon: Horizon, task: Task, normals: Array, level: float, sides: tuple[int, ...]) -> Plan:
     """Half-planes, plan, half-planes from the plan, until nothing changes."""
     plant = horizon.plant
-    c, active, best = np.zeros(plant.n_s * horizon.steps), (), None
+    c, best = np.zeros(plant.n_s * horizon.steps), None
+    active: tuple[int, ...] = ()
     hard = limit_rows(horizon, task.start, task.limits, task.u_bar)
     costs: list[float] = []
     steps = 0
@@ -233,7 +235,7 @@ def _price(horizon: Horizon, task: Task) -> float:
 
 def _rows(
     horizon: Horizon, task: Task, normals: Array, margins: Sequence[Array]
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, NDArray[np.int64]]:
     """Rows of all obstacles, and the group of each: its obstacle and interval."""
     rows, right = [np.zeros((0, horizon.plant.n_s * horizon.steps))], [np.zeros(0)]
     for shape, n, margin in zip(task.shapes, normals, margins, strict=True):
@@ -247,7 +249,7 @@ def _rows(
 
 
 def _solve(
-    G: Array, h: Array, group: Array, hard: tuple[Array, Array], active: tuple[int, ...], price: float
+    G: Array, h: Array, group: NDArray[np.int64], hard: tuple[Array, Array], active: tuple[int, ...], price: float
 ) -> tuple[Array, Array, Array, tuple[int, ...], int]:
     """Hard rows, and where no c keeps them soft ones: c, slack, multipliers, active rows, steps."""
     count = int(group.max(initial=-1)) + 1

@@ -19,9 +19,10 @@ from softgrasp.fem.petsc import Array
 from softgrasp.lqr.constrained.tissue import ModalTissue
 from softgrasp.lqr.plant.checks import ControlError
 
-FORGOTTEN = 1e-10  # of an amplitude: what older pulses leave is bounded by a geometric sum
+FORGOTTEN = 1e-13  # of an amplitude: what older pulses leave is bounded by a geometric sum
 MOST_PULSES = 100_000  # memory of a tissue that hardly decays
-FINE = 32  # instants of an interval where the error is bounded; between them by its acceleration
+FINE = 128  # instants of an interval where the error is bounded; between them by its acceleration
+COARSE = 16  # instants where the acceleration is, a small part of the bound
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class PulseError:
                 amount = passed * coupling[alive, j]
                 result[:, j, begin:last] = shape[:, alive] @ (amount[:, None] * ages).real
             begin, width = last, 2 * width
-        return result.reshape(*self.full.seen.shape[:2], n_s, self.pulses)
+        return np.asarray(result.reshape(*self.full.seen.shape[:2], n_s, self.pulses))
 
     @cached_property
     def _static(self) -> Array:
@@ -105,7 +106,7 @@ class PulseError:
         decay = np.exp(p.real * self.grid)
         left = np.abs(scale * p**derivative * (np.exp(p * self.grid) - 1)) * decay ** (self.pulses - 1) / (1 - decay)
         size = np.abs(shape) @ (left[:, None] * np.abs(coupling))
-        return size.reshape(*self.full.seen.shape[:2], -1)
+        return np.asarray(size.reshape(*self.full.seen.shape[:2], -1))
 
     def level(self, s: float, derivative: int = 0) -> Array:
         """sum_k |w_k(s)| of a unit of each acceleration, (nodes, d, n_s)."""
@@ -115,12 +116,11 @@ class PulseError:
         """Bound on |e_j| at every time, (nodes, d) [m].
 
         At :data:`FINE` instants of an interval exactly; between two of them the error leaves its chord by an eighth of
-        the square of their distance times its acceleration, whose l1 norm, that of the pulses, is taken at the same
-        instants.
+        the square of their distance times its acceleration, whose l1 norm is taken at :data:`COARSE` of them.
 
         ``largest``: bound on |a_i| [m/s2], (n_s,).
         """
-        instants = self.grid * np.arange(1, FINE + 1) / FINE
-        at = np.max([self.level(s) @ largest for s in instants], axis=0)
-        bend = np.max([self.level(s, 2) @ largest for s in (0.0, *instants)], axis=0)
+        instants, coarse = (self.grid * np.linspace(0, 1, count + 1) for count in (FINE, COARSE))
+        at = np.max([self.level(s) @ largest for s in instants[1:]], axis=0)
+        bend = np.max([self.level(s, 2) @ largest for s in coarse], axis=0)
         return np.asarray(at + (self.grid / FINE) ** 2 / 8 * bend)

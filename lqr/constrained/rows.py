@@ -89,7 +89,7 @@ def bends(plant: HeldPlant, states: Array, inputs: Array, normals: Array) -> Arr
 
 
 def _pace(plant: HeldPlant) -> Array:
-    """omega + 2 delta of every mode [1/s]."""
+    """The sum omega + 2 delta of every mode [1/s]."""
     return np.asarray(plant.tissue.omega + 2 * plant.tissue.delta)
 
 
@@ -139,7 +139,7 @@ def tail_level(plant: HeldPlant, gaps: list[tuple[Array, Array]], limits: Limits
         return np.inf
     ratio = np.concatenate(room) / np.concatenate(most)
     least = float(ratio.min())
-    return np.sign(least) * least**2
+    return float(np.sign(least) * least**2)
 
 
 def follow(plant: HeldPlant, x: Array, level: float, most: int) -> tuple[Array, Array]:

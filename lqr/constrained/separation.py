@@ -27,9 +27,8 @@ def separate(shape: Shape, body: Array) -> tuple[Array, float]:
     """The half-plane n.x >= h(n) that keeps a body (b, 2) farthest off an obstacle: n, (2,), and the gap [m]."""
     if isinstance(shape, HalfSpace):
         return shape.normal, float((body @ shape.normal).min() - shape.offset)
-    corners = shape.corners if isinstance(shape, Polytope) else shape.center[None, :] if isinstance(shape, Ball) else None
-    if corners is None:
-        raise TypeError(f"a plan knows no obstacle of the type {type(shape).__name__}")
+    assert isinstance(shape, Ball | Polytope)
+    corners = shape.corners if isinstance(shape, Polytope) else shape.center[None, :]
     hull = body[scipy.spatial.ConvexHull(body).vertices]
     sides = np.roll(hull, -1, axis=0) - hull
     normals = [np.column_stack([-sides[:, 1], sides[:, 0]])]  # inwards: hulls turn to the left
