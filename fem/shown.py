@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from importlib import import_module
 from types import FunctionType
 from typing import Any
 
@@ -50,6 +51,11 @@ class Shown:
 
     def _repr_html_(self) -> str:
         return self.card().html()
+
+
+def drawn(what: str, *of: Any) -> Any:
+    """A figure by the floor that draws, :mod:`softgrasp.study.notebook`, loaded by name: nothing below imports it."""
+    return getattr(import_module("softgrasp.study.notebook"), what)(*of)
 
 
 def brief(value: Any) -> str:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from softgrasp.reduction.reduce import errors as errors
     from softgrasp.reduction.reduce import reduce as reduce
     from softgrasp.reduction.reduce import replay as replay
+    from softgrasp.study.runs.sweep import sweep as sweep
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy: ranks share the cores
     os.environ.setdefault(_variable, "1")
@@ -61,6 +62,7 @@ _FACE = {
     "ClosedLoop": "lqr.loop.full",
     "make_controller": "lqr.design",
     "Controller": "lqr.loop.controller",
+    "sweep": "study.runs.sweep",
 }
 """What a user imports -> the module that has it."""
 

@@ -77,4 +77,11 @@ def test_every_docstring_says_what_a_user_needs(name: str) -> None:
     assert cited <= known
     if name not in ("Scene", "Model", "load", "load_scene", "save"):  # what computes
         assert re.search(r" = |/ \|X\|", text.split(">>>")[0])
-        assert cited or name in ("abscissa", "problem", "Controller", "design", "make_controller")  # definitions
+        assert cited or name in (
+            "abscissa",
+            "problem",
+            "Controller",
+            "design",
+            "make_controller",
+            "sweep",
+        )  # definitions

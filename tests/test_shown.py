@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import softgrasp as sg
 from softgrasp.fem.errors import SceneError, SoftgraspError
@@ -31,7 +33,7 @@ def objects() -> dict[str, Any]:
     strained_run = sg.simulate(strained)
     strain_model = sg.reduce(strained, strained_run, N=14)
     return {
-        "scene": model.scene, "model": model, "run": run, "rom": rom, "system": rom.at(), "lti": rom.lti(),
+        "scene": model.scene, "model": model, "run": run, "rom": rom, "system": rom.at(),
         "replay": sg.replay(rom, model, run), "design": design, "controller": controller,
         "margins": loop_margins(controller), "problem": design.problem, "solution": design.solution, "loop": loop,
         "strained_run": strained_run, "strain_model": strain_model,
@@ -60,7 +62,9 @@ def test_cards_hold_the_numbers_of_the_objects(objects: dict[str, Any]) -> None:
     assert rows["unknowns"] == f"hand 2, tissue {objects['model'].system.layout.n_e}, {objects['model'].states} states"
     assert rows["effects"] == "damping"
     assert "2D, P1, 64 cells" in repr(objects["model"])  # 4 x 8 boxes of two triangles
-    poles = np.linalg.eigvals(np.linalg.solve(objects["lti"].E, objects["lti"].A)[4:, 4:])  # without the free hand
+    poles = np.linalg.eigvals(
+        np.linalg.solve(objects["system"].E, objects["system"].A)[4:, 4:]
+    )  # without the free hand
     assert f"spectral abscissa {poles.real.max():.3g} 1/s" in repr(objects["system"])
 
 
@@ -78,6 +82,49 @@ def test_units_and_labels_of_a_run(objects: dict[str, Any]) -> None:
     assert np.isnan(table["inputs y [N]"].iloc[0])
     assert objects["replay"].to_xarray().outputs.shape == (301, 2)
     assert objects["strain_replay"].to_pandas().index.name == "time [s]"
+
+
+def test_figures_show_what_the_objects_hold(objects: dict[str, Any], tmp_path: Path) -> None:
+    run, rom = objects["run"], objects["rom"]
+    outputs, relative = run.plot().axes
+    np.testing.assert_array_equal(outputs.lines[0].get_ydata(), run.outputs[:, 0])
+    np.testing.assert_array_equal(relative.lines[1].get_ydata(), (run.outputs - run.outputs_rigid)[:, 1])
+    np.testing.assert_array_equal(
+        objects["replay"].plot().axes[0].lines[1].get_ydata(), objects["replay"].outputs[:, 1]
+    )
+    np.testing.assert_array_equal(objects["loop"].plot().axes[0].lines[0].get_ydata(), objects["loop"].outputs[:, 0])
+    assert len(objects["margins"].plot().axes) == 2
+    gain = objects["system"].bode().axes[0].lines[0]
+    omega = gain.get_xdata()[100]
+    E, A, B, C = (getattr(objects["system"], name) for name in "EABC")
+    exact = abs(C @ np.linalg.solve(1j * omega * E - A, B))[0, 0]
+    assert gain.get_ydata()[100] == pytest.approx(exact, rel=1e-9)  # two orders of the same sums
+    _, error = rom.plot_errors(objects["model"], run).axes
+    change = objects["replay"].outputs - run.outputs
+    scale = np.linalg.norm(run.outputs - run.outputs_rigid, axis=1).max()
+    np.testing.assert_allclose(
+        error.lines[0].get_ydata(), np.linalg.norm(change, axis=1)[1:] / scale, atol=1e-12
+    )  # rounding
+    film = run.animate(objects["model"])
+    with Image.open(film.save(tmp_path / "move.gif")) as picture:
+        assert picture.n_frames > 10
+    with pytest.raises(SoftgraspError, match="kept no snapshots"):
+        replace(run, snapshots=None).animate(objects["model"])
+
+
+def test_a_sweep_from_python_is_the_runs_one_by_one() -> None:
+    values = {"tissue.material.mu": [20.0, 500.0], "tissue.cells": [[4, 8]]}
+    table = sg.sweep("paper_forward", values)
+    for point, mu in zip(table.points, values["tissue.material.mu"], strict=True):
+        run = sg.simulate(sg.build("paper_forward", tissue={"cells": [4, 8], "material": {"mu": mu}}))
+        lag = abs(run.outputs - run.outputs_rigid).max(axis=0)[0]
+        assert point.numbers["tip_x lag [m]"] == pytest.approx(lag, rel=1e-12)  # matrices summed, not assembled
+    assert list(table.to_pandas()["tissue.material.mu"]) == [20.0, 500.0]
+    assert "2, of them 0 refused" in repr(table)
+    with pytest.raises(SceneError, match=r"tissue\.material\.nu is not a key"):
+        sg.sweep("paper_forward", {"tissue.material.nu": [0.3]})
+    with pytest.raises(SceneError, match="has 0 points"):
+        sg.sweep("paper_forward", {"tissue.material.mu": []})
 
 
 def test_tables_of_keys_are_overrides() -> None:

@@ -11,10 +11,11 @@ from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.labelled import Labelled, Quantity, of_columns, of_hand
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.snapshots import Snapshots
-from softgrasp.fem.shown import Card, Shown, amount, counted, listed
+from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
 from softgrasp.fem.solve.solvers import SolverUsed
 
 if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
     from softgrasp.fem.strain.newton import NewtonFigures
 
 
@@ -91,6 +92,17 @@ class Trajectory(Shown, Labelled):
     def attributes(self) -> dict[str, Any]:
         """Energy drift and solver."""
         return {"energy_drift": self.energy_drift, "solver": self.solver.name}
+
+    def plot(self) -> Any:
+        """Hand and outputs over time, and what outputs move relative to the hand, as ``matplotlib`` figure."""
+        return drawn("trajectory", self)
+
+    def animate(self, model: Model) -> Any:
+        """The move on the mesh of its model, as an animated picture with ``save``. Collective.
+
+        Raises SoftgraspError: the run kept no snapshots.
+        """
+        return drawn("animation", self, model)
 
     @property
     def output_names(self) -> tuple[str, ...]:

@@ -254,6 +254,14 @@ def _model(annotation: Any) -> type[BaseModel] | None:
     return next((model for part in get_args(annotation) if (model := _model(part))), None)
 
 
+def unit_of(key: str) -> str:
+    """Unit of a key, "Pa" of ``tissue.material.mu``; empty where it has none."""
+    *path, name = key.split(".")
+    description = "[Pa]" if name == "young" else _fields(path).get(name, (None, ""))[1]
+    unit = re.search(r"\[([^]]+)\]", description)
+    return unit[1] if unit is not None and unit[1] not in ("no unit", "1") else ""
+
+
 def _fields(path: Sequence[str]) -> dict[str, tuple[Any, str]]:
     """TOML keys below a path, with annotation and description."""
     model: type[BaseModel] | None = Scene

@@ -19,7 +19,7 @@ from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.snapshots import Snapshots, make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
-from softgrasp.fem.shown import Card, Shown, amount, counted, listed
+from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
 from softgrasp.fem.solve.solvers import Reproducible, SolverUsed, choose_solver
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import accumulated_cost
@@ -111,6 +111,10 @@ class LoopTrajectory(Shown, Labelled):
         """Cost and share of the steps with an input at its limit."""
         return {"cost": float(self.cost[-1]), "saturated": self.saturated}
 
+    def plot(self) -> Any:
+        """Outputs and inputs over time, as ``matplotlib`` figure."""
+        return drawn("loop", self)
+
     @property
     def output_names(self) -> tuple[str, ...]:
         """Labels of the columns."""
@@ -126,7 +130,7 @@ class ClosedLoop:
         problem: plant, outputs and weights.
         dt: time step [s].
         solver: cholesky, mumps, cg, stars or auto.
-        rtol: tolerance of cg and stars.
+        rtol: relative residual at which cg or stars ends a step [1]; None for 1e-8 with cg, 1e-4 with stars.
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 
     Raises:
@@ -145,7 +149,7 @@ class ClosedLoop:
         problem: RiccatiProblem,
         dt: float,
         solver: str = "auto",
-        rtol: float = 1e-4,
+        rtol: float | None = None,
         reproducible: Reproducible = "auto",
     ) -> None:
         if not (np.isfinite(dt) and dt > 0):

@@ -12,14 +12,15 @@ bounds what all inputs withstand at once: every gain in [1/(1+a), 1/(1-a)], ever
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.shown import Card, Shown
+from softgrasp.fem.reduced import ReducedSystem
+from softgrasp.fem.shown import Card, Shown, drawn
 from softgrasp.lqr.loop.controller import Controller
-from softgrasp.reduction.lti import LTI
 
 POINTS = 4000  # frequencies, spaced evenly in log w: 0.3 % apart over five decades
 NEAR = 60  # more around each resonance, where the phase turns at once
@@ -55,6 +56,10 @@ class LoopMargins(Shown):
         ]
         return Card("LoopMargins", (*rows, ("all at once", f"gain {low:.3g} to {high:.3g}, phase {phase:.3g} deg")))
 
+    def plot(self) -> Any:
+        """Gain and phase of the loop at each input, as ``matplotlib`` figure."""
+        return drawn("loop_bode", self)
+
     @property
     def together(self) -> tuple[float, float, float]:
         """Gains [low, high] and phase [deg] that all inputs withstand at once."""
@@ -62,7 +67,7 @@ class LoopMargins(Shown):
         return 1 / (1 + a), 1 / (1 - a) if a < 1 else np.inf, float(np.degrees(2 * np.arcsin(a / 2)))
 
 
-def sampled(plant: LTI, period: float) -> tuple[Array, Array]:
+def sampled(plant: ReducedSystem, period: float) -> tuple[Array, Array]:
     """A_d (N, N) and B_d (N, n_s) of the plant under a load that is held for a period [s]."""
     N, m = plant.B.shape
     solved = np.linalg.solve(plant.E, np.hstack([plant.A, plant.B]))
@@ -77,7 +82,7 @@ def loop_margins(controller: Controller, delay: int = 0) -> LoopMargins:
         controller: gain, plant and period; its limits are left out.
         delay: ticks between a sample and its load.
     """
-    plant, h, K = controller.plant.lti(), controller.period, controller.K
+    plant, h, K = controller.plant, controller.period, controller.K
     A, B = sampled(plant, h)
     poles = np.concatenate([scipy.linalg.eigvals(M, plant.E) for M in (plant.A, plant.under(K).A)])
     omega = _grid(poles, np.pi / h)

@@ -39,7 +39,8 @@ from softgrasp.reduction.certified.motion import (
 )
 from softgrasp.reduction.certified.oscillators import SecondOrder
 from softgrasp.reduction.certified.residual import ResidualNorms
-from softgrasp.reduction.model import ModelError, ReducedModel
+from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.system import ModelError
 
 Certify = Literal["two", "proof", "estimate"]
 TOGETHER = 4_000_000  # entries of the states of a batch that march at once: 32 MB

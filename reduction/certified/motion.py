@@ -16,9 +16,10 @@ from softgrasp.reduction import online
 from softgrasp.reduction.certified.bounds import lengths, node_average
 from softgrasp.reduction.certified.oscillators import Modes, SecondOrder, march
 from softgrasp.reduction.certified.residual import ResidualNorms
-from softgrasp.reduction.model import ModelError, Outputs, ReducedModel
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory, consistent
 from softgrasp.reduction.propagator import propagator
+from softgrasp.reduction.system import ModelError, Outputs
 
 Materials = tuple[LayerMaterial, ...]
 Start = Literal["rest", "equilibrium"]

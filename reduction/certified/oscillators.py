@@ -16,8 +16,9 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.model import ModelError, ReducedModel
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.operators import Parameters
+from softgrasp.reduction.system import ModelError
 
 STEPS = 24  # of a block: near the root of usual numbers of steps
 

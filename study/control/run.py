@@ -27,7 +27,7 @@ from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
 from softgrasp.study.pictures.background import draw_in_background
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Flags, Page, Session, list_files
+from softgrasp.study.shell.session import Flags, Page, Session
 
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 
@@ -86,7 +86,7 @@ def run_control(
         pictures += drawn()
         return report.compose(study, seconds, pictures, [*fields, *saved])
 
-    list_files(console, session.write(model.scene, result, page))
+    session.write(model.scene, result, page)
     if session.comm.rank == 0 and restart is not None:
         remove_own(out, restart)
     session.comm.Barrier()

@@ -28,7 +28,7 @@ from softgrasp.study.effects.verdict import find, shows
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Session, list_files
+from softgrasp.study.shell.session import Session
 
 TIMER = 0.03  # relative difference of two equal runs that cache and page placement can leave in every sample
 
@@ -132,5 +132,5 @@ def run_effects(
         study = study_effects(scene, comm, lambda done, work: bar.update(task, completed=done, total=work))
     result = {"command": "effects", **origin(scene, comm.size), **study.to_dict()}
     result |= {"memory_peak_mb": peak_memory_mb(comm), "time": {}}
-    list_files(console, session.write(scene, result, lambda: compose(study, scene, session)))
+    session.write(scene, result, lambda: compose(study, scene, session))
     return result

@@ -42,16 +42,15 @@ def estimate_error(model: Model, budget: float | None = None) -> tuple[MeshEstim
 
 @dataclass(frozen=True)
 class AccuracyReport:
-    """What a run says of its error; empty where none was estimated."""
+    """What a run reports of its error; empty where none was estimated."""
 
     keys: Mapping[str, Any] = field(default_factory=dict)  # of result.json: ``mesh_error`` and ``time_error``
-    rows: Sequence[tuple[str, str]] = ()  # of the short table
-    summary: Sequence[str] = ()  # the rows in one sentence
-    warnings: Sequence[str] = ()
+    errors: Sequence[str] = ()  # the errors in a sentence
+    warnings: Sequence[str] = ()  # one sentence each
 
 
 def accuracy_report(result: MeshEstimate | None, run: Trajectory) -> AccuracyReport:
-    """The estimate of a run's error as numbers and text."""
+    """The estimate of a run's error as numbers and sentences."""
     if result is None:
         return AccuracyReport()
     keys = {
@@ -67,35 +66,30 @@ def accuracy_report(result: MeshEstimate | None, run: Trajectory) -> AccuracyRep
         "reached": result.tolerance is None or (not result.obstacle and result.estimate <= result.tolerance),
         "seconds": result.seconds,
     }
-    off, bound, in_time = percent(result.estimate), percent(result.bound), percent(result.time_error)
-    better = ""
+    error, bound = percent(result.estimate), percent(result.bound)
+    where = "on this mesh"
+    if result.by == "coarser":
+        where = "or less, as estimated on coarser cells (simulate --certify estimates it on these)"
+    errors = [
+        f"The error of the deformation is about {error} {where}, with a bound of {bound}, and about "
+        f"{percent(result.time_error)} by the time step."
+    ]
     if result.offer is not None and result.estimate > result.offer[0]:
         goal, n_e = result.offer
-        better = f"; {percent(goal)} at n_e = {n_e} with tissue.refine.tolerance = {goal:g}, tissue.order = 2"
+        errors.append(
+            f"An error of {percent(goal)} needs n_e = {n_e}, by tissue.refine.tolerance = {goal:g} and "
+            "tissue.order = 2."
+        )
     warnings = []
     if result.obstacle:
         sure = "not reached" if result.estimate > (result.tolerance or 0.0) else "not certain to be reached"
         warnings.append(
-            f"tissue.refine.tolerance = {result.tolerance:g} is {sure}: the error of the deformation is about {off} "
+            f"tissue.refine.tolerance = {result.tolerance:g} is {sure}: the error of the deformation is about {error} "
             f"(bound {bound}) at n_e = {result.n_e}, since {result.obstacle}."
         )
     if result.shift > 0:
         warnings.append(
-            f"The contact zone ends {result.shift:.3g} m off contact.box, because its facets count by their midpoints; "
-            "[tissue.refine] makes mesh lines meet it."
+            f"The contact zone ends {result.shift:.3g} m beside the edge of contact.box, because its facets count by "
+            "their midpoints; [tissue.refine] makes mesh lines meet that edge."
         )
-    on = (
-        "as estimated on coarser cells; simulate --certify does it on these"
-        if result.by == "coarser"
-        else "on this mesh"
-    )
-    less = " or less" if result.by == "coarser" else ""
-    return AccuracyReport(
-        keys={"mesh_error": keys, "time_error": result.time_error},
-        rows=[
-            ("deformation", f"about {off} off{less} {on} (bound {bound}){better}"),
-            ("", f"about {in_time} off by the time step"),
-        ],
-        summary=[f"The deformation is about {off} off{less} by the mesh and {in_time} by the time step."],
-        warnings=warnings,
-    )
+    return AccuracyReport({"mesh_error": keys, "time_error": result.time_error}, errors, warnings)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
-from rich.padding import Padding
 
 from softgrasp.fem.effects.gate import SMALL_SHARE
 from softgrasp.fem.model.memory import size_text
@@ -15,12 +14,9 @@ from softgrasp.fem.model.scales import SMALL_STRAIN
 from softgrasp.study.forward.explain import EffectReport, Explanation, MeshReport, explain
 from softgrasp.study.report.origin import origin
 from softgrasp.study.report.page import EQUATION, Section
-from softgrasp.study.report.tables import Table, listed, percent
+from softgrasp.study.report.tables import listed, percent
 from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Page, Session, list_files
-
-EFFECTS = ("effect", "verdict", "gate", "number", "matters from", "what it says")
-COSTS = ("effect", "adds", "allocates", "cost")
+from softgrasp.study.shell.session import Page, Session
 
 
 @folder_lock()
@@ -28,47 +24,20 @@ def run_explain(
     path: Path, out: Path | None, overrides: Sequence[str], console: Console, *, empty: bool = False
 ) -> Explanation:
     """Explain a scene file, and write result.json and report.html if there is a folder for them. Collective."""
-    session = Session("explain", path, overrides, out or Path(), console, empty=empty)
-    scene = session.scene(writes=out is not None)
+    session = Session("explain", path, overrides, out or Path(), console, empty=empty, writes=out is not None)
+    scene = session.scene()
     explanation = explain(scene, session.comm)
-    parts = sections(explanation)
-    render(explanation, parts, console)
-    if out is not None:
-        result = {"command": "explain", **origin(scene, session.comm.size), **explanation.to_dict()}
-        page = Page(f"{scene.name}: what it simulates", summary(explanation), parts, options=" --out out")
-        list_files(console, session.write(scene, result, lambda: page, clock=False))
+    page = Page(
+        f"{scene.name}: what it simulates", summary(explanation), sections(explanation), options=" --out out",
+        warnings=remarks(explanation),
+    )  # fmt: skip
+    result = {"command": "explain", **origin(scene, session.comm.size), **explanation.to_dict()}
+    session.write(scene, result, lambda: page, clock=False)
     return explanation
 
 
-def render(result: Explanation, parts: Sequence[Section], console: Console) -> None:
-    """Write an explanation to a terminal, its remarks last; narrow ones wrap."""
-
-    def line(text: str, indent: int = 2) -> None:
-        console.print(Padding.indent(escape(text), indent), highlight=False)
-
-    for part in (*parts[1:], parts[0]):
-        console.print(f"\n[bold]{escape(part.title)}[/]")
-        if part.header == EFFECTS:
-            for name, e in result.effects.items():
-                line(f"{name}: {verdict(e)}")
-                line(e.gate.comparison, 4)
-                line(e.gate.sentence, 4)
-        elif part.header == COSTS:
-            for name, adds, operators, cost in part.rows:
-                line(f"{name} adds {adds}; allocates {operators}.")
-                line(cost, 4)
-        elif part.header:
-            table = Table(tuple(part.header), part.rows).terminal(wrap=range(len(part.header)), width=console.width)
-            console.print(Padding.indent(table, 2))
-        for text in (*part.text.split("\n\n"), *part.code.splitlines()):
-            if text:
-                line(text.strip(), 2 + len(text) - len(text.lstrip()))
-        for row in () if part.header else part.rows:
-            line(f"{row[0]}: {row[1]}")
-
-
 def sections(result: Explanation) -> list[Section]:
-    """The parts of the page; remarks come first."""
+    """The parts of the page."""
     s, t, solver = result.sizes, result.time, result.solver
     sizes = [
         ("hand, tissue unknowns, states", f"n_s = {s.n_s}, n_e = {s.n_e}, 2n = {s.states}"),
@@ -83,11 +52,11 @@ def sections(result: Explanation) -> list[Section]:
         ("time", f"{t.steps} steps of {t.dt:.4g} s to {t.end:.4g} s"),
     ]
     effects = [
-        (name, verdict(e), e.gate.symbol, e.gate.number, e.gate.threshold,
-         f"{e.gate.sentence} It {e.gate.condition}." if e.gate.condition else e.gate.sentence)
+        (f"{name}: {verdict(e)}", ". ".join(filter(None, (e.gate.comparison, e.gate.sentence))))
         for name, e in result.effects.items()
-    ]  # fmt: skip
-    costs = [(name, e.term, ", ".join(e.operators) or "nothing", e.cost) for name, e in result.effects.items() if e.on]
+    ]
+    costs = [(name, f"It adds {e.term} and allocates {listed(e.operators)}. {e.cost}")
+             for name, e in result.effects.items() if e.on]  # fmt: skip
     periods = [(k, w, T, t.dt / T) for k, (w, T) in enumerate(zip(t.omega, t.periods, strict=True), 1)]
     modes = ("mode", "omega [1/s]", "period [s]", "dt / period")
     text = (
@@ -95,16 +64,16 @@ def sections(result: Explanation) -> list[Section]:
     )
     copied = [text] if result.coarser else []
     no_modes = "" if periods else "Not computed: the factor would not fit."
-    return [
-        Section("Warnings", text="\n\n".join(remarks(result)) or "Nothing stands out."),
+    parts = [
         Section(EQUATION, code="\n".join(result.equation.plain().lines()), equation=result.equation),
         Section("Sizes", rows=sizes),
         Section("At rest under its weight, the hand held still", rows=sag_rows(result)),
         Section("Mesh", text="\n\n".join([*copied, *mesh_lines(result.mesh, result.dimension)])),
-        Section("Effects", header=EFFECTS, rows=effects),
-        *([Section("What is on", header=COSTS, rows=costs)] if costs else []),
+        Section("Effects", rows=effects),
+        *([Section("What is on", rows=costs)] if costs else []),
         Section("First modes of the clamped tissue", no_modes, header=modes if periods else (), rows=periods),
     ]
+    return [replace(part, terminal=True) for part in parts]
 
 
 def summary(result: Explanation) -> list[str]:
@@ -153,10 +122,9 @@ def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
         lines.append("This is the first mesh: simulate may refine it further, to meet tissue.refine.tolerance.")
     if report.estimate is not None and report.bound is not None and report.time_error is not None:
         lines.append(
-            f"The deformation is about {percent(report.estimate)} "
-            f"{'or less off, as estimated on coarser cells' if report.coarser else 'off on this mesh'} "
-            f"(bound {percent(report.bound)}) and "
-            f"about {percent(report.time_error)} by the time step."
+            f"The error of the deformation is about {percent(report.estimate)} "
+            f"{'or less, as estimated on coarser cells' if report.coarser else 'on this mesh'} "
+            f"(bound {percent(report.bound)}), and {percent(report.time_error)} by the time step."
         )
     else:
         lines.append(

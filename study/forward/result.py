@@ -137,7 +137,7 @@ class Simulation:
         run, sizes = self.run, self.sizes
         place = ", ".join(f"{x:.4g}" for x in run.q_s[-1])
         lag = np.abs(run.outputs - run.outputs_rigid).max(axis=0, initial=0.0)
-        texts = [f"At t = {run.times[-1]:.4g} s the hand stands at ({place})."]
+        texts = [f"At t = {run.times[-1]:.4g} s the hand is at ({place})."]
         if len(lag):
             i = int(lag.argmax())
             texts.append(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
@@ -24,9 +23,8 @@ from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.page import Section, captioned, of_scene
-from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Flags, Page, Session, list_files, show_warnings
+from softgrasp.study.shell.session import Flags, Page, Session, list_files
 
 CAPTIONS = {
     "move.png": "The body at some instants of the move.",
@@ -89,7 +87,6 @@ def run_simulate(
     mesh_error, unknown = estimate_error(model, None if certify else SHARE * run_seconds(model))
     accuracy = accuracy_report(mesh_error, run)
     result = replace(result, warnings=(*result.warnings, *accuracy.warnings, *([unknown] if unknown else [])))
-    rows = [*result.rows(), *accuracy.rows]
 
     def page() -> Page:
         drawn = frames.draw(out, run)
@@ -97,13 +94,13 @@ def run_simulate(
             from softgrasp.study.forward.plots import figure_mesh_error  # brings Matplotlib
 
             drawn += figure_mesh_error(out / "mesh_error.png", run, mesh_error)
-        sections = _sections(result, rows, drawn)
-        return Page(scene.name, [*result.summary(), *accuracy.summary], sections, tables, [*fields, *drawn])
+        return Page(
+            scene.name, result.summary(), _sections(result, drawn), tables, [*fields, *drawn],
+            errors=accuracy.errors, warnings=result.warnings,
+        )  # fmt: skip
 
     numbers = {**result.to_json(), **accuracy.keys}
-    console.print(pairs(rows))
-    show_warnings(console, result.warnings[len(model.space.mesh.notes) :])  # those were shown with the mesh
-    list_files(console, session.write(scene, numbers, page))
+    session.write(scene, numbers, page)
     if certify and mesh_error is None:
         raise SolverError(unknown)
     return numbers
@@ -136,7 +133,7 @@ def _lost(frames: Frames, run: Run) -> str:
     return text
 
 
-def _sections(result: Simulation, numbers: Sequence[tuple[str, str]], drawn: list[Path]) -> list[Section]:
+def _sections(result: Simulation, drawn: list[Path]) -> list[Section]:
     scene = result.scene
     faster = speed_up(np.array([0.0, scene.time_end]))
     move = "The move in real time." if faster == 1 else f"The move at {faster:g} times its speed."
@@ -146,8 +143,7 @@ def _sections(result: Simulation, numbers: Sequence[tuple[str, str]], drawn: lis
     ]
     return [
         Section("", figures=captioned(drawn, CAPTIONS | {"move.gif": move})),
-        Section("Result", rows=numbers),
-        *([Section("Warnings", text="\n\n".join(result.warnings))] if result.warnings else []),
+        Section("Result", rows=result.rows(), terminal=True),
         of_scene(scene),
         Section("Effects", header=("effect", "on", "adds", "cost"), rows=effects),
     ]

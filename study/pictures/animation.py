@@ -19,7 +19,7 @@ from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.fem.owned import note
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, legend, make_axes, make_shot, name_layers
 from softgrasp.study.pictures.shapes import speed_up
-from softgrasp.study.pictures.style import TARGET, colour_map, paper_style
+from softgrasp.study.pictures.style import TARGET, colour_map, fit, paper_style
 
 MOST_FRAMES = 60
 TICKS = 2  # shortest time of a frame [1/100 s]; viewers slow down what is shorter
@@ -31,14 +31,19 @@ REST = 1.0  # [s] the last frame stays longer
 def gif_move(
     picture: PictureMesh, frames: Array, times: Array, table: Array, target: npt.ArrayLike | None, out_gif: Path
 ) -> Path:
-    """Body, hand, path and target in motion, in real time from 0.3 to 30 s; at most 60 frames and 3 MB.
+    """:func:`move_bytes` as a file, whose name is returned."""
+    return write_gif(move_bytes(picture, frames, times, table, target), out_gif)
+
+
+def move_bytes(picture: PictureMesh, frames: Array, times: Array, table: Array, target: npt.ArrayLike | None) -> bytes:
+    """A GIF of body, hand, path and target in motion, in real time from 0.3 to 30 s; at most 60 frames and 3 MB.
 
     Too many frames are thinned out; for the arguments see :func:`softgrasp.study.pictures.body.figure_move`.
     """
     kept, durations = timing(times)
     frames, times = frames[kept].astype(np.float64), times[kept]
     shot = make_shot(picture, frames, times, table, target)
-    return write_gif(_render(shot, frames, times), durations, out_gif)
+    return gif_bytes(_render(shot, frames, times), durations)
 
 
 def timing(times: Array) -> tuple[list[int], list[int]]:
@@ -84,7 +89,7 @@ def film(
     """
     canvas, images = figure.canvas, []
     figure.set_dpi(DPI)
-    _fit(figure, figure.get_tightbbox().padded(0.08))
+    fit(figure, 0.08)
     for artist in (*others, *(line for ax in axes for line in ax.lines)):
         artist.set_animated(True)  # no part of the background
     canvas.draw()
@@ -104,24 +109,15 @@ def film(
     return images
 
 
-def _fit(figure: Any, box: Any) -> None:
-    """Give a figure the size of a box [inch], everything in it where it is."""
-    figure.set_layout_engine("none")
-    size = figure.get_size_inches()
-    scale, corner = size / box.size, box.min / box.size
-    places = [(ax, ax.get_position().get_points() * scale - corner) for ax in figure.axes]
-    anchors = [(placed, placed.get_bbox_to_anchor().min / figure.dpi / box.size - corner) for placed in figure.legends]
-    for text in figure.texts:
-        text.set_position(np.array(text.get_position()) * scale - corner)
-    figure.set_size_inches(*box.size)
-    for ax, (low, high) in places:
-        ax.set_position((*low, *(high - low)))
-    for placed, anchor in anchors:
-        placed.set_bbox_to_anchor(tuple(anchor), transform=figure.transFigure)
+def write_gif(gif: bytes, out_gif: Path) -> Path:
+    """Write an animated picture and return its path."""
+    note(out_gif)
+    out_gif.write_bytes(gif)
+    return out_gif
 
 
-def write_gif(images: list[Any], durations: list[int], out_gif: Path) -> Path:
-    """Write frames of one size, each with its duration [ms], smaller if they would take more than 3 MB."""
+def gif_bytes(images: list[Any], durations: list[int]) -> bytes:
+    """A GIF of frames of one size, each with its duration [ms], smaller if they would take more than 3 MB."""
     palette = _palette()
     for scale in (1.0, 0.8, 0.6, 0.45):
         size = tuple(round(scale * n) for n in images[0].size)
@@ -131,9 +127,7 @@ def write_gif(images: list[Any], durations: list[int], out_gif: Path) -> Path:
         first.save(buffer, format="GIF", save_all=True, append_images=rest, duration=durations, loop=0, optimize=False)
         if buffer.tell() <= MOST_BYTES:
             break
-    note(out_gif)
-    out_gif.write_bytes(buffer.getvalue())
-    return out_gif
+    return buffer.getvalue()
 
 
 def _palette() -> Any:

@@ -23,7 +23,20 @@ def figure_traces(
     rigid: Array | None = None,
     dimension: int | None = None,
 ) -> tuple[Path, ...]:
-    """Hand and outputs against time, and below what the outputs move relative to the hand; PNG and PDF.
+    """:func:`traces` as PNG and PDF, whose names are returned."""
+    return save(traces(times, outputs, columns, q_s, rigid=rigid, dimension=dimension), out_png)
+
+
+def traces(
+    times: Array,
+    outputs: Array,
+    columns: Columns,
+    q_s: Array,
+    *,
+    rigid: Array | None = None,
+    dimension: int | None = None,
+) -> Any:
+    """Hand and outputs against time, and below what the outputs move relative to the hand; a Matplotlib figure.
 
     An output that is the hand again is drawn once, as the hand, and has no share in what moves relative to it.
 
@@ -52,12 +65,12 @@ def figure_traces(
         for k, i in enumerate(shown):
             style = ("-", "-.", ":")[bodies.index(columns[i].name) % 3]
             look: dict[str, Any] = {"color": CYCLE[axes_of[i]], "ls": style}
-            axes[0].plot(times, factors[0][0] * outputs[:, i], label=columns[i].formula, **look)
+            axes[0].plot(times, factors[0][0] * outputs[:, i], label=columns[i].title, **look)
             axes[1].plot(times, factors[1][0] * relative[:, k], **look)
         # The hand last: its thin dashes lie on the lines of the outputs.
         for j in np.flatnonzero(np.abs(q_s[:, :d]).max(axis=0) > 0).tolist():
             look = {"color": HAND, "ls": ((0, (4, 3)), (0, (1, 1.5)), (0, (4, 2, 1, 2)))[j], "lw": 0.8}
-            axes[0].plot(times, factors[0][0] * q_s[:, j], label=f"hand, ${'xyz'[j]}$", **look)
+            axes[0].plot(times, factors[0][0] * q_s[:, j], label=f"hand, {'xyz'[j]}", **look)
         axes[0].set_ylabel(f"displacement [{factors[0][1]}]")
         if shown:
             axes[1].set_ylabel(f"relative to hand [{factors[1][1]}]")
@@ -74,7 +87,7 @@ def figure_traces(
         axes[-1].set_xlabel("time [s]")
         axes[-1].set_xlim(float(times[0]), float(times[-1]))
         figure.align_ylabels(axes)
-        return save(figure, out_png)
+        return figure
 
 
 def _not_the_hand(outputs: Array, columns: Columns, axes_of: list[int], q_s: Array, d: int) -> list[int]:

@@ -41,7 +41,7 @@ from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import command_line, origin, peak_memory_mb
 from softgrasp.study.report.page import EQUATION, Section
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.session import Page, Session, list_files
+from softgrasp.study.shell.session import Page, Session
 
 PAPER = f"{PAPER_REDUCED} s and a state error of about 1e-3 at N = 14"
 
@@ -81,7 +81,7 @@ def write_study(session: Session, study: WorkStudy, request: Request) -> dict[st
         return Page(title, summary(study), sections, {"points.csv": points_table(study)}, figures, request.options)
 
     show(session.console, study, commands)
-    list_files(session.console, session.write(study.scene, result, page))
+    session.write(study.scene, result, page)
     comm.Barrier()
     return result
 

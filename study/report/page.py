@@ -54,8 +54,16 @@ class Section:
     header: Sequence[str] = ()  # names of the columns; without it two columns are label and value
     rows: Sequence[Sequence[Any]] = ()  # a table; every row as long as the header. Numbers are shown with four digits.
     figures: Sequence[tuple[Path, str]] = ()  # (picture file, caption); the files are embedded
-    terminal: bool = False  # a terminal shows the text and the table too
+    terminal: bool = False  # a terminal shows texts and table too
     best: Sequence[int] = ()  # rows of a long table that stand unfolded; the first ones if there are none
+    details: str = ""  # further paragraphs, folded on the page
+
+    @property
+    def unfolded(self) -> Sequence[Sequence[Any]]:
+        """Rows that stand unfolded on the page, and alone in a terminal."""
+        if not self.header or len(self.rows) <= MOST_ROWS:
+            return self.rows
+        return [self.rows[i] for i in self.best or range(SHOWN)]
 
 
 def captioned(files: Sequence[Path], captions: Mapping[str, str]) -> list[tuple[Path, str]]:
@@ -86,6 +94,8 @@ def write_report(
     *,
     title: str,
     summary: Sequence[str],
+    errors: Sequence[str] = (),
+    warnings: Sequence[str] = (),
     subtitle: str = "",
     sections: Sequence[Section] = (),
     scene: Scene | None = None,
@@ -98,6 +108,8 @@ def write_report(
 
     Args:
         summary: sentences that say what came out.
+        errors: sentences on the error of the result; coloured, above the summary.
+        warnings: sentences that a reader must not miss; coloured, below the errors.
         scene: what was run; its equation is added unless a section has it.
         reproduce: the commands that made this page.
         result: what result.json holds, for sizes and times.
@@ -115,11 +127,14 @@ def write_report(
         TEMPLATE.read_text(encoding="utf-8")
     )
     prepared = [_prepared(section) for section in given]
-    text = " ".join((*summary, *(part for s in prepared for part in (s["title"], *s["paragraphs"], *s["header"]))))
+    parts = (part for s in prepared for part in (s["title"], *s["paragraphs"], *s["details"], *s["header"]))
+    text = " ".join((*errors, *warnings, *summary, *parts))
     text += " ".join(str(row[0]) for s in prepared for row in s["rows"])
     html = page.render(
         title=title,
         subtitle=subtitle,
+        errors=errors,
+        warnings=warnings,
         summary=summary,
         sections=prepared,
         words=words_of(text),
@@ -148,16 +163,22 @@ def _prepared(section: Section) -> dict[str, Any]:
     rows = [[cell_text(cell) for cell in row] for row in section.rows]
     return {
         "title": section.title,
-        "paragraphs": [part.strip() for part in section.text.split("\n\n") if part.strip()],
+        "paragraphs": paragraphs(section.text),
+        "details": paragraphs(section.details),
         "code": section.code,
         "equation": "" if section.equation is None else equation_html(section.equation),
         "header": section.header,
         "rows": rows,
-        "unfolded": [rows[i] for i in section.best or range(SHOWN)] if section.header and len(rows) > MOST_ROWS else [],
+        "unfolded": [[cell_text(cell) for cell in row] for row in section.unfolded],
         "align": [Markup(f' class="{kind}"') if kind else "" for kind in kinds],
         "kind": "wider" if section.header else "pairs",
         "figures": figures,
     }
+
+
+def paragraphs(text: str) -> list[str]:
+    """The parts of a text between empty lines."""
+    return [part.strip() for part in text.split("\n\n") if part.strip()]
 
 
 def _column(cells: Sequence[Any]) -> str:

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rich.box
 import rich.table
 from rich.console import Console
 from rich.markup import escape
 
+from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.owned import note
 from softgrasp.study.report.page import NUMBERS, Section, cell_text
 
@@ -63,7 +65,7 @@ class Table:
         columns = [[name, *(cell_text(row[i]) for row in self.rows)] for i, name in enumerate(self.header)]
         widths = [max(map(len, cells)) for cells in columns]
         for i in wrap:
-            words = [self.header[i], *(word for cell in columns[i] for word in cell.split())]
+            words = [word for cell in columns[i] for word in cell.split()]
             excess = sum(widths) + len(widths) - width
             widths[i] -= max(0, min(excess, widths[i] - max(map(len, words))))
         for i, name in enumerate(self.header):
@@ -108,16 +110,34 @@ def table_of(rows: Sequence[Any], columns: Columns, title: str = "") -> Table:
 
 
 def show_sections(console: Console, sections: Sequence[Section]) -> None:
-    """The parts of a page that a terminal shows too: the text, then the table, whose cells may break."""
-    for part in (s for s in sections if s.terminal):
+    """The parts of a page that a terminal shows too: title, table, whose cells may break, and texts."""
+    shown = [s for s in sections if s.terminal]
+    for part in shown:
+        if part.title and len(shown) > 1:
+            console.print(f"\n{part.title}", style="bold", markup=False)
         if part.header:
-            table = Table(tuple(part.header), part.rows).terminal(wrap=range(len(part.header)), width=console.width)
-            table.collapse_padding = True
-            console.print(table)
+            _show_table(console, part)
         elif part.rows:
             console.print(pairs(part.rows))
-        if part.text:
-            console.print(part.text, style="dim", markup=False, highlight=False)
+        for text, style in ((part.text, None), (part.details, "dim"), (part.code, None)):
+            if text:
+                console.print(text, style=style, markup=False, highlight=False)
+
+
+def _show_table(console: Console, part: Section) -> None:
+    """The unfolded rows, of as many columns as the terminal is wide, and how many are left out."""
+    header, rows = [*part.header], [[*row] for row in part.unfolded]
+    words = [[word for row in (header, *rows) for word in cell_text(row[i]).split()] for i in range(len(header))]
+    ends = np.cumsum([1 + max(map(len, column), default=0) for column in words])
+    fitting = max(2, int(np.searchsorted(ends, console.width, side="right")))
+    cut = Table(tuple(header[:fitting]), [row[:fitting] for row in rows])
+    table = cut.terminal(wrap=range(len(cut.header)), width=console.width)
+    table.collapse_padding = True
+    console.print(table)
+    left = {"row": len(part.rows) - len(rows), "column": len(header) - len(cut.header)}
+    if any(left.values()):
+        more = listed([counted(count, f"more {what}") for what, count in left.items() if count])
+        console.print(f"... and {more}", style="dim")
 
 
 def listed(names: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from softgrasp.study.pictures.style import BLUE, COLUMN, CYCLE, OUTLINE, colour_map, few_ticks, paper_style, save
 from softgrasp.study.report.tables import Table
-from softgrasp.study.runs.sweep import SweepAxis, SweepPoint
+from softgrasp.study.runs.sweep import SweepAxis, SweepPoint, axis_label
 
 BARS = 16  # numbers that a picture of two runs shows: the largest changes
 PANELS = 4  # outputs of a picture
@@ -32,10 +32,10 @@ def figure_sweep(axes: Sequence[SweepAxis], points: Sequence[SweepPoint], file: 
             for value, colour in curves:
                 shown = [p for p in points if second is None or p.values[second.key] == value]
                 y = [p.lags().get(name, np.nan) for p in shown]
-                label = None if second is None else f"{second.key.rsplit('.', 1)[-1]} = {value:.4g}"
+                label = None if second is None else f"{axis_label(second.key)} = {value:.4g}"
                 axis.plot([p.values[first.key] for p in shown], y, ".-", color=colour, label=label)
             axis.set_ylabel(name.replace(" lag ", ", largest lag\nbehind the rigid motion "))
-        panels[-1, 0].set_xlabel(first.key)
+        panels[-1, 0].set_xlabel(f"{first.key.rpartition('.')[0]}.{axis_label(first.key)}".lstrip("."))
         if first.log:
             panels[-1, 0].set_xscale("log")
             few_ticks(panels[-1, 0].xaxis)

@@ -12,11 +12,11 @@ from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.study.report.origin import origin
-from softgrasp.study.report.page import SHOWN, Section, cell_text
+from softgrasp.study.report.page import SHOWN, Section
 from softgrasp.study.report.tables import Table
-from softgrasp.study.runs.sweep import METHOD, Sweep, SweepPoint, parse_axes, run_sweep_points
+from softgrasp.study.runs.sweep import METHOD, Sweep, SweepPoint, axis_label, parse_axes, run_sweep_points
 from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
+from softgrasp.study.shell.session import Page, Session
 
 UNITS = {"energy_drift": "energy drift", "seconds": "time [s]"}
 COARSE = 0.1  # error of the deformation above which a reduced sweep is warned of
@@ -28,24 +28,18 @@ REDUCED = (
 
 
 def sweep_table(points: Sequence[SweepPoint]) -> Table:
-    """One row a point; a reason where it failed."""
+    """One row a point, all that is known; a reason where it failed."""
     rows = [point.row() for point in points]
     keys = list(dict.fromkeys(key for row in rows for key in row))
-    best = sorted({round(i * (len(rows) - 1) / (SHOWN - 1)) for i in range(SHOWN)})
-    header = tuple(UNITS.get(key, key) for key in keys)
-    return Table(header, [[row.get(key) for key in keys] for row in rows], best=best)
+    return Table(tuple(UNITS.get(key, key) for key in keys), [[row.get(key) for key in keys] for row in rows])
 
 
-def short_table(points: Sequence[SweepPoint], width: int) -> Table:
-    """The keys by their last words, the lags and the error, as many as a terminal has room for."""
+def short_table(points: Sequence[SweepPoint]) -> Table:
+    """The keys by their last words, with units, the lags and the error of the reduced model."""
     rows = [{**p.values, **{n: x for n, x in p.numbers.items() if " end " not in n and n not in UNITS}} for p in points]
-    names = {key: key if " " in key else key.rsplit(".", 1)[-1] for row in rows for key in row}
-    while len(names) > 1:
-        cells = {key: [*name.split(), *(cell_text(row.get(key)) for row in rows)] for key, name in names.items()}
-        if sum(1 + max(map(len, texts)) for texts in cells.values()) <= width:
-            break
-        names.popitem()
-    return Table(tuple(names.values()), [[row.get(key) for key in names] for row in rows])
+    names = {key: axis_label(key) if key in points[0].values else key for row in rows for key in row}
+    best = sorted({round(i * (len(rows) - 1) / (SHOWN - 1)) for i in range(SHOWN)})
+    return Table(tuple(names.values()), [[row.get(key) for key in names] for row in rows], "Points", best)
 
 
 def summary(sweep: Sweep, points: Sequence[SweepPoint]) -> list[str]:
@@ -91,7 +85,6 @@ def run_sweep(
     failed = [point.reason for point in points if point.reason]
     if len(failed) == len(points):
         raise SceneError(f"no point of the sweep could be run; the first: {failed[0]}")
-    table = sweep_table(points)
     notes = [f"{len(failed)} of {len(points)} points failed: {failed[0]}"] if failed else []
     if (worst := max(point.numbers.get("error_deformation") or 0.0 for point in points)) > COARSE:
         notes.append(
@@ -105,16 +98,13 @@ def run_sweep(
 
         files = figure_sweep(sweep.axes, points, out / "sweep.png") if pictures else ()
         text = f"{LAG} {REDUCED}" if reduced else LAG
-        parts = [Section("", figures=[(files[0], "Largest lag of every output.")] if files else []),
-                 *([Section("Warnings", text="\n\n".join(notes))] if notes else []),
-                 table.section(text, "Points")]  # fmt: skip
+        parts = [
+            Section("", figures=[(files[0], "Largest lag of every output.")] if files else []),
+            short_table(points).section(text, terminal=True),
+        ]
         options = "".join(f" {text}" for text in axes) + (f" --reduced {reduced}" if reduced else "")
-        return Page(f"{scene.name}: sweep", summary(sweep, points), parts, {"sweep.csv": table}, files, options)
+        table = {"sweep.csv": sweep_table(points)}
+        return Page(f"{scene.name}: sweep", summary(sweep, points), parts, table, files, options, warnings=notes)
 
-    short = short_table(points, console.width)
-    console.print(short.terminal(wrap=range(len(short.header)), width=console.width))
-    if (left := len(points[0].row()) - len(short.header)) > 0:
-        console.print(f"{left} more columns are in sweep.csv")
-    show_warnings(console, notes)
-    list_files(console, session.write(scene, result, page))
+    session.write(scene, result, page)
     return result

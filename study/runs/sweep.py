@@ -6,9 +6,10 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,19 +18,22 @@ from mpi4py import MPI
 from softgrasp import package_version
 from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.errors import Interrupted, SceneError, SoftgraspError, shortened
+from softgrasp.fem.labelled import table
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.owned import note, remove_own
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.fem.scene.file import load_scene
+from softgrasp.fem.scene.file import find_scene, load_scene, unit_of
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.shown import Card, Shown, listed
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.reduce import reduce_linear
 from softgrasp.reduction.replay import errors_linear, full_run, replay_linear
 
 METHOD = "craig_bampton"  # needs no snapshots of the other values, and is stable at all of them
 MOST = 100_000  # points: each is a run
+DECADE = 10.0  # ratio of the largest listed value to the least from which an axis is logarithmic
 FORM = "write KEY=FIRST:LAST:COUNT, KEY=FIRST:LAST:COUNT:log or KEY=A,B,C, as in tissue.material.mu=100:500:9"
 
 
@@ -37,9 +41,15 @@ FORM = "write KEY=FIRST:LAST:COUNT, KEY=FIRST:LAST:COUNT:log or KEY=A,B,C, as in
 class SweepAxis:
     """One key and its values."""
 
-    key: str
-    values: tuple[float, ...]
-    log: bool = False
+    key: str  # of the scene
+    values: tuple[float, ...]  # in its unit
+    log: bool = False  # whether its axis is logarithmic
+
+
+def axis_label(key: str) -> str:
+    """The last word of a key with its unit, "mu [Pa]"."""
+    name, unit = key.rsplit(".", 1)[-1], unit_of(key)
+    return f"{name} [{unit}]" if unit else name
 
 
 def parse_axis(text: str) -> SweepAxis:
@@ -63,6 +73,7 @@ def parse_axis(text: str) -> SweepAxis:
     if not good:
         raise SceneError(f"'{shortened(text)}' is no sweep; {FORM}")
     whole = all(x == int(x) for x in values) and "." not in right and "e" not in right.lower()
+    log = log or (len(parts) == 1 and min(values) > 0 and max(values) >= DECADE * min(values))
     return SweepAxis(key, tuple(int(x) for x in values) if whole else tuple(values), log)
 
 
@@ -72,9 +83,15 @@ def parse_axes(texts: Sequence[str]) -> tuple[SweepAxis, ...]:
     keys = [axis.key for axis in axes]
     if twice := next((shortened(key) for key in keys if keys.count(key) > 1), None):
         raise SceneError(f"{twice} is swept twice; give all its values at once, as in {twice}=1,2,5")
-    if (count := math.prod(len(axis.values) for axis in axes)) > MOST:
-        raise SceneError(f"the sweep has {count} points; give at most {MOST}, by fewer values")
+    checked_count(axes)
     return axes
+
+
+def checked_count(axes: Sequence[SweepAxis]) -> None:
+    """Raise SceneError where these have no point, or too many."""
+    count = math.prod(len(axis.values) for axis in axes)
+    if not 0 < count <= MOST:
+        raise SceneError(f"the sweep has {count} points; give at least one and at most {MOST}")
 
 
 @dataclass(frozen=True)
@@ -214,6 +231,54 @@ def run_sweep_points(
         done |= part
     group.Free()
     return [done[key] for key in keys]
+
+
+@dataclass(frozen=True, repr=False)
+class SweepTable(Shown):
+    """The points of a sweep in their order."""
+
+    points: tuple[SweepPoint, ...]
+    """Values and numbers of every point."""
+
+    def card(self) -> Card:
+        """Keys, and what there is at each point."""
+        first = self.points[0]
+        failed = sum(bool(point.reason) for point in self.points)
+        rows = (
+            ("keys", listed(first.values)),
+            ("numbers", listed(first.numbers)),
+            ("points", f"{len(self.points)}, of them {failed} refused"),
+        )
+        return Card("Sweep", rows)
+
+    def to_pandas(self) -> Any:
+        """One row a point, as ``pandas.DataFrame``. Raises SoftgraspError: pandas is not installed."""
+        return table(point.row() for point in self.points)
+
+
+def sweep(scene: str | Path, values: Mapping[str, Sequence[float]], *, N: int | None = None) -> SweepTable:
+    """Lag = max_t |y - C_s q_s| and end = y(T) of a scene at all combinations of some values of its keys. Collective.
+
+    >>> import softgrasp as sg
+    >>> table = sg.sweep("paper_forward", {"tissue.material.mu": [20, 500], "tissue.cells": [[2, 4]]})
+    >>> [point.numbers["tip_x lag [m]"] > 0.01 for point in table.points]
+    [True, True]
+
+    Args:
+        scene: the path of its file, or the name of one that ships.
+        values: of each key, "section.key"; where only the material differs nothing is assembled again.
+        N: columns of a reduced model that runs instead of the full one (a sweep of the material).
+
+    Raises:
+        SceneError: a key or a value is wrong, or there are more than 100000 points; a point that cannot be run has
+            its ``reason`` instead of numbers.
+    """
+    axes = tuple(SweepAxis(key, tuple(each)) for key, each in values.items())
+    checked_count(axes)
+    plan = Sweep(find_scene(scene), (), axes, N)
+    with TemporaryDirectory(prefix="softgrasp-sweep-") as folder:
+        points = run_sweep_points(plan, Path(folder), MPI.COMM_WORLD, MPI.COMM_WORLD.size, lambda done, of: None)
+    return SweepTable(tuple(points))
 
 
 def _keys(sweep: Sweep, scenes: Sequence[Scene]) -> list[str]:

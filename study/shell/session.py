@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,7 +31,7 @@ from softgrasp.study.shell.folder import claim, files_of, read_result, remove_fi
 
 @dataclass(frozen=True)
 class Page:
-    """What a command writes beside result.json."""
+    """One document: what a command prints, and writes beside result.json."""
 
     title: str
     summary: Sequence[str]  # three sentences that say what came out
@@ -39,6 +39,9 @@ class Page:
     tables: Mapping[str, Table] = field(default_factory=dict)  # by the name of its CSV file
     files: Sequence[Path] = ()  # written already: pictures and fields
     options: str = ""  # of the command line, for the page's last line: " --tolerance 1e-2"
+    reproduce: str = ""  # the whole command line, where it is no softgrasp COMMAND SCENE
+    errors: Sequence[str] = ()  # sentences on the error of the result
+    warnings: Sequence[str] = ()  # sentences that a reader must not miss
 
 
 class Flags(TypedDict, total=False):
@@ -61,28 +64,37 @@ class Session:
     quiet: bool = False  # no progress bars
     pictures: bool = True
     empty: bool = False  # remove what an earlier run has left in the folder
+    writes: bool = True  # False: print only
     begin: float = field(default_factory=time.perf_counter)  # [s]
+    notes: list[str] = field(default_factory=list)  # what the mesh warns of, printed when the model was built
 
     @property
     def comm(self) -> MPI.Intracomm:
         """Ranks that run the command."""
         return MPI.COMM_WORLD
 
-    def scene(self, *, writes: bool = True) -> Scene:
-        """Load the scene file, claim the folder if it ``writes`` there, and print name and description. Collective.
+    def scene(self) -> Scene:
+        """Load the scene file, claim the folder, and print name and description. Collective.
 
         Raises SceneError: the file or a key is wrong, or the folder holds another run.
         """
         scene = load_scene_collective(self.comm, self.path, self.overrides)
-        with raise_on_all_ranks(self.comm):
-            if writes and self.comm.rank == 0:
-                inputs = [find_scene(self.path), *scene.files]
-                claim(self.out, self.command, scene.name, inputs=inputs, empty=self.empty)
-        if writes:
-            follow(self.out)
+        self.claim(scene.name, lambda: [find_scene(self.path), *scene.files])
         described = f": {escape(scene.description)}" if scene.description else ""
         self.console.print(f"[bold]{escape(scene.name)}[/bold]{described}", soft_wrap=True)
         return scene
+
+    def claim(self, name: str, inputs: Callable[[], Iterable[Path]]) -> None:
+        """Lock the folder for a run of this name, which reads these files. Collective.
+
+        Raises SceneError: see :func:`softgrasp.study.shell.folder.claim`.
+        """
+        if not self.writes:
+            return
+        with raise_on_all_ranks(self.comm):
+            if self.comm.rank == 0:
+                claim(self.out, self.command, name, inputs=inputs(), empty=self.empty)
+        follow(self.out)
 
     def model(self, scene: Scene, steps: bool = True) -> Model:
         """Build a scene and print its size and what its mesh warns of. Collective.
@@ -97,7 +109,8 @@ class Session:
             model = adapt.build(scene, comm=self.comm, steps=steps)
         layout = model.system.layout
         self.console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)")
-        show_warnings(self.console, model.space.mesh.notes)
+        self.notes.extend(model.space.mesh.notes)
+        show_warnings(self.console, self.notes)
         return model
 
     def progress(self, count: ProgressColumn) -> Progress:
@@ -126,43 +139,57 @@ class Session:
                 write_json(self.out / "result.json", {**result, "files": sorted(names)})
 
     def write(
-        self, scene: Scene, result: dict[str, Any], page: Callable[[], Page], *, clock: bool = True
-    ) -> list[Path]:
-        """Write result.json and scene.toml, then pictures, tables and report.html; the files on rank 0. Collective.
+        self, scene: Scene | None, result: dict[str, Any], page: Callable[[], Page], *, clock: bool = True
+    ) -> None:
+        """Print the page, and write result.json, scene.toml, pictures, tables and report.html. Collective.
 
-        ``page`` draws and composes the rest, on rank 0 only, so it must not communicate. Files of the run before in
-        this folder that are not written again are removed. On rank 0 ``result`` takes the names of all files, and with
-        ``clock`` the times ``total`` and ``pictures`` and the seconds of CPU.
+        ``page`` draws and composes, on rank 0 only, so it must not communicate. Files of the run before in this folder
+        that are not written again are removed. On rank 0 ``result`` takes the names of all files, and with ``clock``
+        the times ``total`` and ``pictures`` and the seconds of CPU.
 
         Raises OSError on all ranks: the folder cannot be written.
         """
-        files: list[Path] = []
         with raise_on_all_ranks(self.comm):
             if self.comm.rank == 0:
-                self.out.mkdir(parents=True, exist_ok=True)
-                before = files_of(read_result(self.out))
-                files += [write_json(self.out / "result.json", result), write_scene(self.out, scene)]
-                drawing = time.perf_counter(), sum(os.times()[:4])
-                content = page()
-                show_sections(self.console, content.sections)
-                now = time.perf_counter(), sum(os.times()[:4])
-                files += [table.write_csv(self.out / name) for name, table in content.tables.items()]
-                files += content.files
-                line = command_line(self.command, self.path, self.overrides, self.comm.size, content.options)
-                report = write_report(
-                    self.out / "report.html", title=content.title, subtitle=scene.description, result=result,
-                    sections=content.sections, summary=content.summary, files=files, scene=scene, reproduce=line,
-                )  # fmt: skip
-                files.append(report)
-                if clock:
-                    result.setdefault("time", {}).update(
-                        pictures=now[0] - drawing[0], total=time.perf_counter() - self.begin,
-                        pictures_cpu=now[1] - drawing[1], total_cpu=sum(os.times()[:4]),
-                    )  # fmt: skip
-                result["files"] = [f.relative_to(self.out).as_posix() for f in files if f.is_relative_to(self.out)]
-                write_json(self.out / "result.json", result)
-                remove_files(self.out, set(before) - set(result["files"]))
-        return files
+                self._write(scene, result, page, clock)
+
+    def _write(self, scene: Scene | None, result: dict[str, Any], page: Callable[[], Page], clock: bool) -> None:
+        if not self.writes:
+            self.show(page())
+            return
+        self.out.mkdir(parents=True, exist_ok=True)
+        before, numbers = files_of(read_result(self.out)), self.out / "result.json"
+        files = [write_json(numbers, result), *([] if scene is None else [write_scene(self.out, scene)])]
+        drawing = time.perf_counter(), sum(os.times()[:4])
+        content = page()
+        self.show(content)
+        now = time.perf_counter(), sum(os.times()[:4])
+        files += [*(table.write_csv(self.out / name) for name, table in content.tables.items()), *content.files]
+        line = command_line(self.command, self.path, self.overrides, self.comm.size, content.options)
+        report = write_report(
+            self.out / "report.html", title=content.title, subtitle=scene.description if scene else "", result=result,
+            sections=content.sections, summary=content.summary, errors=content.errors, files=files, scene=scene,
+            warnings=list(dict.fromkeys([*self.notes, *content.warnings])), reproduce=content.reproduce or line,
+        )  # fmt: skip
+        files.append(report)
+        if clock:
+            result.setdefault("time", {}).update(
+                pictures=now[0] - drawing[0], total=time.perf_counter() - self.begin,
+                pictures_cpu=now[1] - drawing[1], total_cpu=sum(os.times()[:4]),
+            )  # fmt: skip
+        result["files"] = [f.relative_to(self.out).as_posix() for f in files if f.is_relative_to(self.out)]
+        write_json(numbers, result)
+        remove_files(self.out, set(before) - set(result["files"]))
+        list_files(self.console, files)
+
+    def show(self, page: Page) -> None:
+        """Print the parts of a page that are for a terminal, its errors, summary and warnings. Rank 0 prints."""
+        show_sections(self.console, page.sections)
+        for text in page.errors:
+            self.console.print(text, style="bold", markup=False, highlight=False)
+        for text in page.summary:
+            self.console.print(text, markup=False, highlight=False)
+        show_warnings(self.console, [text for text in page.warnings if text not in self.notes])
 
 
 def progress_bar(console: Console, count: ProgressColumn, *, quiet: bool = False) -> Progress:

@@ -22,11 +22,12 @@ from softgrasp.fem.owned import LIST
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.fem.scene.scene import scene_schema
 from softgrasp.study.forward.run import run_simulate
+from softgrasp.study.report.tables import show_sections
 from softgrasp.study.runs import sweep as sweep_module
 from softgrasp.study.runs.listing import apart, compare, run_compare, runs_below
 from softgrasp.study.runs.run import run_sweep, short_table
 from softgrasp.study.runs.start import SCHEMA, materials_table, new_scene
-from softgrasp.study.runs.sweep import SweepPoint, parse_axes, parse_axis
+from softgrasp.study.runs.sweep import SweepPoint, axis_label, parse_axes, parse_axis
 
 SMALL = ["tissue.cells=[3,6]", "time.steps=60"]
 SCENE = shipped_scenes()["paper_forward"]
@@ -96,15 +97,24 @@ def test_a_reduced_sweep_tells_its_error_and_a_failed_point_its_reason(tmp_path:
     assert "reason" in failed["points"][1]
 
 
-def test_the_table_of_a_sweep_fits_into_a_terminal() -> None:
+def test_the_table_of_a_sweep_fits_into_a_terminal_and_has_units() -> None:
     outputs = {f"tip_{x} {what} [m]": 0.123456 for what in ("lag", "end") for x in "xyz"}
     rows = [SweepPoint({"tissue.material.mu": 20.0}, {**outputs, "energy_drift": 1.2e-15, "seconds": 1.1e-3})] * 2
-    for width, kept in ((80, 3), (20, 2)):
-        table = short_table(rows, width)
-        assert table.header == ("mu", "tip_x lag [m]", "tip_y lag [m]", "tip_z lag [m]")[: 1 + kept]
+    table = short_table(rows)
+    assert table.header == ("mu [Pa]", "tip_x lag [m]", "tip_y lag [m]", "tip_z lag [m]")
+    for width, left in ((80, 0), (20, 1)):
         console = Console(width=width, file=io.StringIO())
-        console.print(table.terminal(wrap=range(1 + kept), width=width))
+        show_sections(console, [table.section(terminal=True)])
         assert "…" not in console.file.getvalue()
+        assert (f"... and {left} more" in console.file.getvalue()) == bool(left)
+
+
+def test_an_axis_has_its_unit_and_listed_decades_are_logarithmic() -> None:
+    assert axis_label("tissue.material.mu") == axis_label("tissue.layers.skin.material.mu") == "mu [Pa]"
+    assert axis_label("time.steps") == "steps"
+    assert [parse_axis(f"a.b={right}").log for right in ("20,50,200", "20,50,100", "1:100:9", "0,1,100")] == [
+        True, False, False, False,
+    ]  # fmt: skip
 
 
 @pytest.mark.serial

@@ -28,14 +28,14 @@ from softgrasp.reduction.certified.trainer import (
     train_key,
     validate,
 )
-from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import run_at
+from softgrasp.reduction.system import ModelError
 from softgrasp.study.reduce.certified.measure import REPEATS, check_box
 from softgrasp.study.reduce.certified.report import CAPTIONS, greedy_table, sentences, shown, tests_table
 from softgrasp.study.reduce.certified.result import BoxCheck
 from softgrasp.study.reduce.result import reduce_result
 from softgrasp.study.report.page import Section, captioned
-from softgrasp.study.shell.session import Page, Session, list_files
+from softgrasp.study.shell.session import Page, Session
 from softgrasp.study.shell.timing import median_seconds
 
 FILE = "certified.h5"
@@ -89,7 +89,7 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
 
     for sentence in lines:
         console.print(sentence, markup=False)
-    list_files(console, session.write(scene, result, page))
+    session.write(scene, result, page)
     return result
 
 

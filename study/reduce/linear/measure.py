@@ -16,11 +16,12 @@ from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.bases.states import BasisError, States, states_of
 from softgrasp.reduction.bases.truncation import Truncation
 from softgrasp.reduction.errors import ModelComparison
-from softgrasp.reduction.model import ModelError, ReducedModel
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.reduce import project_scene
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
+from softgrasp.reduction.system import ModelError
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
     LARGER,

@@ -20,7 +20,7 @@ from softgrasp.study.reduce.linear.result import N_NOTE, MethodSweep, ReductionS
 from softgrasp.study.reduce.linear.views import gather_views
 from softgrasp.study.reduce.times import FullTimes, measured_run
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.session import Page, Session, list_files
+from softgrasp.study.shell.session import Page, Session
 
 
 def run_linear(session: Session, scene: Scene, names: Sequence[str]) -> dict[str, Any]:
@@ -52,7 +52,7 @@ def run_linear(session: Session, scene: Scene, names: Sequence[str]) -> dict[str
         return Page(f"{scene.name}: reduced models", report.summary(study), parts, points, [*files, *models])
 
     show(session.console, study)
-    list_files(session.console, session.write(scene, result, page))
+    session.write(scene, result, page)
     return result
 
 

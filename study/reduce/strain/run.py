@@ -15,7 +15,7 @@ from softgrasp.study.reduce.strain.report import cell_table, error_table, sectio
 from softgrasp.study.reduce.strain.result import StrainFamily, StrainPoint, StrainStudy
 from softgrasp.study.reduce.times import measured_run
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.session import Page, Session, list_files
+from softgrasp.study.shell.session import Page, Session
 
 
 def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
@@ -65,7 +65,7 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
         session.console.print(table.terminal(wrap=(0,), width=session.console.width))
     for sentence in (*lines, *summary(study)):
         session.console.print(sentence, markup=False)
-    list_files(session.console, session.write(scene, result, page))
+    session.write(scene, result, page)
     return result
 
 

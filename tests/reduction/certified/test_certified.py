@@ -28,8 +28,8 @@ from softgrasp.reduction.certified.motion import Drive
 from softgrasp.reduction.certified.oscillators import march
 from softgrasp.reduction.certified.residual import ResidualSpace
 from softgrasp.reduction.certified.training import certified_any, certified_model
-from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.reduce import project_scene
+from softgrasp.reduction.system import ModelError
 from tests.helpers.certified import (
     EQUILIBRIUM,
     KELVIN_VOIGT,

@@ -61,7 +61,7 @@ def test_simulate_writes_what_design_promises(tmp_path: Path, ranks: int) -> Non
     assert "data:image/png;base64" in page
     strains, zone = result["warnings"]  # of the paper's move, and of its cells, which hold from 44/30 on
     assert "small strains" in strains
-    assert zone.startswith("The contact zone ends 0.0333 m off contact.box")
+    assert zone.startswith("The contact zone ends 0.0333 m beside the edge of contact.box")
     assert result["mesh_error"]["estimate"] == pytest.approx(
         0.40, abs=0.02
     )  # against finer runs: tests of fem.accuracy

@@ -1,0 +1,146 @@
+"""Figures of objects for a notebook: what their ``plot``, ``bode``, ``plot_errors`` and ``animate`` return.
+
+Figures belong to no window: a notebook shows them where they are the last value of a cell, ``savefig`` writes them.
+"""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import scipy.linalg
+
+from softgrasp.fem.columns import Array, OutputColumn
+from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.reduced import ReducedSystem
+from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.lqr.loop.full import LoopTrajectory
+from softgrasp.lqr.loop.margins import LoopMargins
+from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.online import ReducedTrajectory
+from softgrasp.reduction.reduce import errors, replay
+from softgrasp.study.control.plots import bode
+from softgrasp.study.pictures.animation import move_bytes
+from softgrasp.study.pictures.loop import histories
+from softgrasp.study.pictures.style import CYCLE, FULL, WIDTH, length_unit, log_axis, paper_style
+from softgrasp.study.pictures.traces import traces
+
+FREQUENCIES = 800  # of a Bode diagram, even in log w
+FILM_FRAMES = 60
+
+
+def _free(figure: Any) -> Any:
+    """The figure without its window, else a notebook would show it twice."""
+    plt.close(figure)
+    return figure
+
+
+def trajectory(run: Trajectory) -> Any:
+    """Hand and outputs over time. Not collective."""
+    return _free(traces(run.times, run.outputs, run.columns, run.q_s, rigid=run.outputs_rigid, dimension=_space(run)))
+
+
+def reduced(run: ReducedTrajectory) -> Any:
+    """Hand and outputs over time. Not collective."""
+    columns = tuple(OutputColumn(*name.rpartition("_")[::2]) for name in run.output_names)
+    return _free(traces(run.times, run.outputs, columns, run.q_s))
+
+
+def loop(run: LoopTrajectory) -> Any:
+    """Outputs and inputs over time. Not collective."""
+    return _free(histories(run.times, run.outputs, run.inputs, run.columns, dimension=_space(run)))
+
+
+def loop_bode(margins: LoopMargins) -> Any:
+    """Gain and phase of the loop at each input. Not collective."""
+    return _free(bode(margins))
+
+
+def _space(run: Trajectory | LoopTrajectory) -> int:
+    return 3 if any(column.axis == "z" for column in run.columns) else 2
+
+
+def system_bode(system: ReducedSystem) -> Any:
+    """Gain |C (i w E - A)^-1 B| and phase from each input to each output. Not collective."""
+    sizes = np.abs(scipy.linalg.eigvals(system.A, system.E))
+    sizes = sizes[np.isfinite(sizes) & (sizes > 1e-8 * sizes.max())]  # without the free hand
+    omega = np.geomspace(0.1 * sizes.min(), 10 * sizes.max(), FREQUENCIES)
+    H = system.transfer(1j * omega)
+    with paper_style():
+        figure, (gain, phase) = plt.subplots(2, 1, figsize=(WIDTH, 0.6 * WIDTH), sharex=True, layout="constrained")
+        for k, (i, j) in enumerate(np.ndindex(H.shape[1:])):
+            if np.abs(H[:, i, j]).max() < 1e-12 * np.abs(H).max():
+                continue  # coupled by rounding alone
+            name, look = (
+                f"{system.inputs[j]} to {system.outputs[i]}",
+                {"color": CYCLE[k % 4], "ls": ("-", "--")[k // 4 % 2]},
+            )
+            gain.loglog(omega, np.abs(H[:, i, j]), label=name, **look)
+            phase.semilogx(omega, np.degrees(np.unwrap(np.angle(H[:, i, j]))), **look)
+        gain.set_ylabel("gain [output unit / input unit]")
+        phase.set(xlabel="frequency [rad/s]", ylabel="phase [deg]")
+        gain.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return _free(figure)
+
+
+def model_errors(rom: ReducedModel, model: Model, run: Trajectory) -> Any:
+    """Outputs relative to the hand of both runs, and their difference over the largest of them. Collective."""
+    small = replay(rom, model, run)
+    error = errors(rom, small, model, run).error_deformation
+    full, answer = run.outputs - run.outputs_rigid, small.outputs - run.outputs_rigid
+    scale = float(np.linalg.norm(full, axis=1).max()) or 1.0
+    factor, unit = length_unit(float(np.abs(full).max(initial=0.0)))
+    with paper_style():
+        figure, (top, below) = plt.subplots(2, 1, figsize=(WIDTH, 0.55 * WIDTH), sharex=True, layout="constrained")
+        for i, name in enumerate(run.output_names):
+            top.plot(run.times, factor * answer[:, i], color=CYCLE[i % len(CYCLE)], label=f"{name}, N = {rom.N}")
+        lines = top.plot(run.times, factor * full, **{**FULL, "zorder": 3})
+        lines[0].set_label("full model")
+        below.plot(run.times[1:], np.linalg.norm(answer - full, axis=1)[1:] / scale, color=CYCLE[0])
+        log_axis(below, None)
+        top.set_ylabel(f"relative to hand [{unit}]")
+        below.set(xlabel="time [s]", ylabel="error over largest output [1]")
+        top.set_title(f"{rom.name}: error of the deformation {100 * error:.2g} %")
+        top.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return _free(figure)
+
+
+@dataclass(frozen=True)
+class Film:
+    """An animated picture; notebooks show it."""
+
+    gif: bytes  # the file
+
+    def save(self, file: str | Path) -> Path:
+        """Write it as GIF and return its path."""
+        Path(file).write_bytes(self.gif)
+        return Path(file)
+
+    def __repr__(self) -> str:
+        return f"Film of {len(self.gif) / 1e6:.1f} MB; save it by film.save('move.gif')"
+
+    def _repr_html_(self) -> str:
+        return f'<img alt="the move" src="data:image/gif;base64,{base64.b64encode(self.gif).decode()}">'
+
+
+def animation(run: Trajectory, model: Model) -> Film:
+    """The move as an animated picture. Collective; rank 0 draws, the others get an empty film.
+
+    Raises SoftgraspError: the run kept no snapshots.
+    """
+    kept = run.snapshots
+    if kept is None:
+        raise SoftgraspError("the run kept no snapshots in memory; set output.snapshots = 'memory'")
+    pick = np.unique(np.linspace(0, len(kept.steps) - 1, FILM_FRAMES).round().astype(int))
+    n = kept.layout.n_local
+    picture, states = gather_picture(model), vertex_displacement(model, kept.Z[:n, pick], kept.q_s[:, pick])
+    if picture is None or states is None:
+        return Film(b"")
+    table: Array = np.column_stack([run.times, run.q_s])
+    return Film(move_bytes(picture, states, kept.times[pick], table, model.scene.motion.target))
