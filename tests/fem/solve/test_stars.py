@@ -102,6 +102,20 @@ def test_solves_agree_with_a_dense_solve_on_any_ranks(comm: MPI.Intracomm, name:
 
 
 @pytest.mark.ranks
+def test_stars_are_whole_on_any_ranks(comm: MPI.Intracomm) -> None:
+    """The matrix of their inverses is that of one rank, also where cells at a vertex are no ghosts of its owner."""
+    found = []
+    for ranks in (comm, MPI.COMM_SELF):
+        system = build("block_3d", silicone([3, 3, 4]), ranks).system
+        solver = make_solver(dynamic_stiffness(system, 400.0), "stars", system.layout, "test_")
+        assert solver.stars is not None
+        B = solver.stars.matrices[1].convert("aij", PETSc.Mat())
+        found.append(gather_matrix(system.layout, B).toarray())
+        solver.destroy()
+    assert close(*found) < 1e-10  # condition of a star below 1e4
+
+
+@pytest.mark.ranks
 def test_iterations_are_few_on_any_ranks(comm: MPI.Intracomm) -> None:
     """Measured 24 to 28 for S and 29 to 33 for K; CG with GAMG takes 108 and 134 at n_e = 8397."""
     model = build("block_3d", silicone([4, 3, 8]), comm)
