@@ -14,9 +14,10 @@ from softgrasp.fem.effects.gate import SMALL_SHARE, Sag
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.mesh.singular import expected_order
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.model.memory import Need, factor_bytes, need, solver_of
+from softgrasp.fem.model.memory import Need, factor_bytes, free_bytes, need, solver_of
 from softgrasp.fem.model.refined import by_lines, scene_ends
 from softgrasp.fem.model.scales import SMALL_STRAIN, measure
+from softgrasp.fem.run.forecast import Forecast, forecasts
 from softgrasp.fem.run.motion import largest_acceleration
 from softgrasp.fem.run.snapshots import spread
 from softgrasp.fem.scene.scene import Scene
@@ -107,6 +108,7 @@ class Explanation:
     warnings: tuple[str, ...]  # one sentence each
     outputs: dict[str, str]  # name and place of each output
     memory: Need  # estimated need of mesh, factor and steps
+    forecasts: tuple[Forecast, ...]  # modelled cost of the run by the number of ranks; none at finite strain
     snapshot_columns: int  # number of states that the run stores in memory
     snapshot_bytes: int  # memory of these states over all ranks [byte]
     mesh: MeshReport  # singular ends, and the error they leave
@@ -169,7 +171,8 @@ def explain_model(model: Model) -> Explanation:
         sag=problem.sag,
         warnings=(*model.space.mesh.notes, *_warnings(scene, poisson, omega, dt, d, reports, problem.sag)),
         outputs=output_places(model),
-        memory=need(scene, d, sizes.cells, layout.comm, run=True),
+        memory=need(scene, d, sizes.cells, ranks, layout.comm.allreduce(free_bytes(scene), MPI.MIN), run=True),
+        forecasts=forecasts(model),
         snapshot_columns=columns,
         snapshot_bytes=16 * layout.n_e * columns,
         mesh=mesh_report(model, looked),
