@@ -6,16 +6,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import import_module
+from typing import Any, Self
 
 import numpy as np
+from mpi4py import MPI
 
-from softgrasp.fem.errors import SolverError
+from softgrasp.fem.columns import TURNS, Columns, hand_columns
+from softgrasp.fem.errors import SoftgraspError, SolverError
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import Card, Shown, drawn, listed
 
 STEPS = 8  # in one product: more would not gain at N = 30, where a product costs as much as the call
 BLOCK_ENTRIES = 32_768  # of the matrix of several steps: 256 kB stay in a core's own cache
+
+
+class ReducedSystemError(SoftgraspError):
+    """A reduced system is asked for what it does not hold."""
 
 
 def midpoint_map(E: Array, A: Array, loads: Array, dt: float) -> Array:
@@ -120,3 +129,154 @@ def march_together(steps: Sequence[MidpointSteps], inputs: Array, start: Array) 
     states[:, 0] = start
     states[:, 1:] = after.swapaxes(0, 1).reshape(runs, blocks * b, k)[:, :number]
     return states
+
+
+@dataclass(frozen=True, repr=False)
+class StateSpace(Shown):
+    """E x' = A x + B u, y = C x, dense, of dimension N."""
+
+    E: Array  # matrix of the rates, regular, (N, N)
+    A: Array  # matrix of the states, (N, N)
+    B: Array  # matrix of the inputs, (N, m); of force and torque on the hand m = n_s
+    C: Array  # matrix of the outputs, (p, N)
+
+    @property
+    def N(self) -> int:
+        """Dimension of the first-order system."""
+        return len(self.A)
+
+
+@dataclass(frozen=True, repr=False)
+class ReducedSystem(StateSpace):
+    """E x' = A x + B u + f, y = C x, q_s = S_q x, v_s = S_v x: hand and tissue in N coordinates, at one parameter.
+
+    Transfer functions, closed loops and the objects of other packages are of deviations from a state of rest, in which
+    the constant load f drops out.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
+    >>> system = sg.reduce(model, sg.simulate(model), "craig_bampton", N=12).at()
+    >>> system.inputs, system.transfer([1j]).shape
+    (('force_x [N]', 'force_y [N]'), (1, 2, 2))
+    """
+
+    f: Array  # constant load of gravity, (N,)
+    S_q: Array  # displacement of the hand, (n_s, N)
+    S_v: Array  # velocity of the hand, (n_s, N)
+    names: tuple[str, ...] = ()  # names of the outputs, "tip_x"; y_1.. where their number does not fit
+
+    def card(self) -> Card:
+        """Dimension, inputs and outputs."""
+        rows = (("states", str(self.N)), ("inputs", listed(self.inputs)), ("outputs", listed(self.outputs)))
+        return Card("ReducedSystem E x' = A x + B u + f, y = C x", rows)
+
+    @property
+    def n_s(self) -> int:
+        """Degrees of freedom of the hand."""
+        return len(self.S_q)
+
+    @cached_property
+    def hand_first(self) -> bool:
+        """Whether the state begins with q_s [m, rad] and v_s [m/s, rad/s]."""
+        one = np.eye(2 * self.n_s, self.N)
+        return np.array_equal(np.vstack([self.S_q, self.S_v]), one)
+
+    def midpoint(self, dt: float) -> MidpointSteps:
+        """Its midpoint steps under the inputs u of the steps (steps, n_s). Not collective."""
+        return MidpointSteps(dt, self.E, self.A, np.column_stack([self.B, self.f]))
+
+    def rest_at(self, q_bar: Array) -> tuple[Array, Array]:
+        """x_bar (N,) and u_bar (n_s,) with 0 = A x + B u + f and S_q x = q_bar.
+
+        Raises ReducedSystemError: the system has no such state, or more than one.
+        """
+        K = np.block([[self.A, self.B], [self.S_q, np.zeros((self.n_s, self.n_s))]])
+        scale = np.abs(K).max(axis=1)
+        right = np.concatenate([-self.f, np.asarray(q_bar, dtype=np.float64)])
+        if (scale == 0).any() or not np.linalg.cond(K / scale[:, None]) < 1e14:  # rounding: no digit would be right
+            raise ReducedSystemError("the reduced plant has no unique state of rest for a position of the hand")
+        solution = np.linalg.solve(K / scale[:, None], right / scale)
+        return solution[: self.N], solution[self.N :]
+
+    def transfer(self, s: Sequence[complex] | np.ndarray) -> np.ndarray:
+        """Transfer function C (s E - A)^{-1} B at points s [1/s], (len(s), p, n_s)."""
+        points = np.asarray(s, dtype=complex).reshape(-1, 1, 1)
+        return np.asarray(
+            self.C @ np.linalg.solve(points * self.E - self.A, np.broadcast_to(self.B, (len(points), *self.B.shape)))
+        )
+
+    def bode(self) -> Any:
+        """Gain and phase from each input to each output, as ``matplotlib`` figure."""
+        return drawn("system_bode", self)
+
+    def under(self, K: Array) -> Self:
+        """The closed loop u = K x + r with the extra load r as input. python-control's own functions take -K.
+
+        Raises ReducedSystemError: K (n_s, N) does not fit, or is not finite.
+        """
+        shape = self.B.T.shape
+        if K.shape != shape or not np.isfinite(K).all():
+            raise ReducedSystemError(
+                f"the gain has the shape {K.shape}; this plant needs finite numbers of shape {shape}"
+            )
+        return replace(self, A=self.A + self.B @ K)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states with their units, "q_x [m]"; those of the tissue have none."""
+        hand = self._hand if self.hand_first else ()
+        units = [(c.axis, c.unit) for c in hand]
+        first = (*(f"q_{axis} [{unit}]" for axis, unit in units), *(f"v_{axis} [{unit}/s]" for axis, unit in units))
+        return first + tuple(f"x_{i + 1}" for i in range(len(first), self.N))
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs with their units, "force_x [N]"."""
+        return tuple(f"{'torque' if c.rotation else 'force'}_{c.axis} [{c.load_unit}]" for c in self._hand)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs with their units, "tip_x [m]"."""
+        return tuple(f"{name} [{'rad' if name.rsplit('_', 1)[-1] in TURNS else 'm'}]" for name in self._labels)
+
+    @property
+    def _labels(self) -> tuple[str, ...]:
+        fits = len(self.names) == len(self.C)
+        return self.names if fits else tuple(f"y_{i + 1}" for i in range(len(self.C)))
+
+    @property
+    def _hand(self) -> Columns:
+        space = self.n_s == 6 or any(name.endswith("_z") for name in self._labels)
+        return hand_columns(self.n_s, 3 if space else 2, "hand")
+
+    def to_control(self) -> Any:
+        """The system as ``control.StateSpace`` with named inputs, states and outputs.
+
+        Raises ReducedSystemError: python-control is not installed.
+        """
+        try:
+            control: Any = import_module("control")  # by name: optional, and without type hints
+        except ImportError as error:
+            raise ReducedSystemError("python-control is not installed; `pip install control` brings it") from error
+        A, B = np.split(np.linalg.solve(self.E, np.hstack([self.A, self.B])), [self.N], axis=1)
+        # python-control may drop states that it thinks uncontrollable, and its names hold no dots
+        names = {
+            key: [name.replace(".", "_") for name in getattr(self, key)] for key in ("states", "inputs", "outputs")
+        }
+        D = np.zeros((len(self.C), B.shape[1]))
+        return control.ss(A, B, self.C, D, remove_useless_states=False, **names)
+
+    def to_pymor(self) -> Any:
+        """The system as ``pymor.models.iosys.LTIModel``, in programs of one rank.
+
+        Raises ReducedSystemError: pyMOR is not installed, or the program runs on several ranks.
+        """
+        if MPI.COMM_WORLD.size > 1:  # importing pyMOR would put all ranks but the first into an event loop of its own
+            raise ReducedSystemError(
+                f"to_pymor runs on one rank, not on {MPI.COMM_WORLD.size}; save the model and load it there"
+            )
+        try:
+            from pymor.models.iosys import LTIModel
+        except ImportError as error:
+            raise ReducedSystemError("pyMOR is not installed; `pip install pymor` brings it") from error
+        return LTIModel.from_matrices(self.A, self.B, self.C, E=self.E)

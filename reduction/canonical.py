@@ -32,7 +32,6 @@ from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.operators import (
-    Operators,
     Parameters,
     Parts,
     Reconstruction,
@@ -40,6 +39,7 @@ from softgrasp.reduction.operators import (
     relative_rows,
     symmetric,
 )
+from softgrasp.reduction.system import EnergySystem, Outputs
 
 MASS_RTOL = 1e-13  # of cg, where no direct solver fits: the lifted velocity inherits it
 
@@ -94,12 +94,16 @@ def hand_velocity(parts: Parts, p: Parameters, fixed: bool, absolute: bool) -> A
     return np.linalg.solve(inertia, parts["S_p"] + parts["TV"] - parts["VW_G"].T)
 
 
-def canonical_operators(parts: Parts, p: Parameters, fixed: bool, absolute: bool) -> Operators:
-    """E, A, B, F and the energies at one parameter; online.
+def canonical_system(
+    name: str, parts: Parts, p: Parameters, outputs: Outputs, fixed: bool, absolute: bool
+) -> EnergySystem:
+    """The system at one parameter; online.
 
     Args:
+        name: name of the basis.
         parts: from :func:`canonical_parts`.
         p: materials; their densities are ``scale`` times those of the projection.
+        outputs: outputs of the scene.
         fixed: the hand's displacement and velocity are the first 2 n_s coordinates.
         absolute: the tissue rows of the basis are absolute.
     """
@@ -148,4 +152,8 @@ def canonical_operators(parts: Parts, p: Parameters, fixed: bool, absolute: bool
             if p.two_way:
                 D = D + p.alpha * c * S_q.T @ (parts["GL"] + parts["M_rigid"] @ S_q)
         E = E - D
-    return Operators(E, A, B, F, S_q, S_v, energy, hamiltonian)
+    C = outputs.C_z + outputs.C_s @ S_q
+    return EnergySystem(
+        E, A, B, C, p.load(F), S_q, S_v, outputs.names, name=name, C_s=outputs.C_s, H_tissue=energy, H=hamiltonian,
+        two_way=p.two_way, structured=p.conservative, scale=p.scale,
+    )  # fmt: skip

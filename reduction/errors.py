@@ -22,8 +22,9 @@ from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.engines import factor
-from softgrasp.reduction.model import ModelError, ReducedModel, ReducedSystem
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory
+from softgrasp.reduction.system import EnergySystem, ModelError
 
 BLOCK = 64  # columns at a time: 64 columns of both states are a small part of the snapshots themselves
 RANK_TOLERANCE = 1e-13  # of the largest singular value: directions below are rounding of the basis
@@ -84,7 +85,7 @@ def row_weights(system: BlockSystem) -> tuple[Array, float]:
     return np.sqrt(diagonal)[:, None], float(np.sqrt(whole[0] / whole[1]))
 
 
-def shown_rows(view: View, model: ReducedModel, small: ReducedSystem, system: BlockSystem) -> Array:
+def shown_rows(view: View, model: ReducedModel, small: EnergySystem, system: BlockSystem) -> Array:
     """V with V Y = the state of the model for Y = [x; q_s; v_s], local rows, (..., N + 2 n_s). Collective.
 
     Raises ModelError: the model holds no basis on the mesh.
@@ -153,7 +154,7 @@ class ModelComparison:
     """Errors of one model, or of a whole family of nested ones, against one full run."""
 
     model: ReducedModel  # largest model of the family
-    small: ReducedSystem  # its system at the parameter of the snapshots
+    small: EnergySystem  # its system at the parameter of the snapshots
     system: BlockSystem  # of the full run
     snapshots: Snapshots  # of the full run
     energy: Array  # :func:`full_energy` of the snapshots
@@ -169,7 +170,7 @@ class ModelComparison:
             self._spans[view] = span_of(view, V, self.system, self.snapshots)
         return self._spans[view]
 
-    def state_error(self, view: View, model: ReducedModel, small: ReducedSystem, run: ReducedTrajectory) -> float:
+    def state_error(self, view: View, model: ReducedModel, small: EnergySystem, run: ReducedTrajectory) -> float:
         """|X - X_r|_F / |X|_F of a run on the full model's time grid, of the largest model or a smaller. Collective.
 
         Raises ModelError: the run is shorter than the snapshots, or the model shows more than the largest.
@@ -181,14 +182,14 @@ class ModelComparison:
         Y = np.vstack([run.x[steps].T, run.q_s[steps].T, run.v_s[steps].T])
         return span.error(span.inside(shown_rows(view, model, small, self.system)), Y)
 
-    def errors(self, model: ReducedModel, small: ReducedSystem, run: ReducedTrajectory) -> ModelErrors:
+    def errors(self, model: ReducedModel, small: EnergySystem, run: ReducedTrajectory) -> ModelErrors:
         """All errors of a run; see :meth:`state_error`. Collective."""
         velocities, momenta, deformation = (self.state_error(view, model, small, run) for view in VIEWS)
         error = np.abs(small.energy(run.x[self.snapshots.steps]) - self.energy).max(initial=0.0)
         peak = float(self.energy.max(initial=0.0))
         return ModelErrors(velocities, momenta, deformation, float(error) / (peak if peak > 0 else 1.0))
 
-    def projection_error(self, view: View, model: ReducedModel, small: ReducedSystem) -> float:
+    def projection_error(self, view: View, model: ReducedModel, small: EnergySystem) -> float:
         """min_Y |X - V Y|_F / |X|_F over all states V y, with the hand q_s = S_q y and v_s = S_v y. Collective.
 
         Raises ModelError: the model shows more than the largest.
@@ -198,9 +199,9 @@ class ModelComparison:
         return span.projection_error(R @ with_hand(small))
 
 
-def with_hand(small: ReducedSystem) -> Array:
+def with_hand(small: EnergySystem) -> Array:
     """[I; S_q; S_v]: the hand that belongs to a reduced state, (N + 2 n_s, N)."""
-    return np.vstack([np.eye(small.N), small.operators.S_q, small.operators.S_v])
+    return np.vstack([np.eye(small.N), small.S_q, small.S_v])
 
 
 def column_blocks(m: int) -> Iterator[slice]:

@@ -18,7 +18,6 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.system import BlockSystem, coupling
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.operators import (
-    Operators,
     Parameters,
     Parts,
     Reconstruction,
@@ -26,6 +25,7 @@ from softgrasp.reduction.operators import (
     relative_rows,
     symmetric,
 )
+from softgrasp.reduction.system import EnergySystem, Outputs
 
 
 def unit_coupling(system: BlockSystem) -> tuple[list[Array], list[Array]]:
@@ -64,8 +64,8 @@ def galerkin_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Reconstruc
     return parts, Reconstruction(system.layout, Z, Z_v)
 
 
-def galerkin_operators(parts: Parts, p: Parameters) -> Operators:
-    """E, A, B, F and the energies at one parameter; online."""
+def galerkin_system(name: str, parts: Parts, p: Parameters, outputs: Outputs, second_order: bool) -> EnergySystem:
+    """The system at one parameter; online. ``second_order``: the basis keeps the equations of second order."""
     S_q, S_v, M_hand = parts["S_q"], parts["S_v"], parts["M_hand"]
     G, rigid = p.density(parts["WG"]), p.density(parts["rigid"])
     Z_G = p.density(parts["ZG"])
@@ -80,13 +80,20 @@ def galerkin_operators(parts: Parts, p: Parameters) -> Operators:
     energy = symmetric(p.stiffness(parts["energy_mu"], parts["energy_lambda"]) + p.density(parts["energy_M"]))
     cross = Z_G @ S_v
     hand = M_hand + rigid if p.two_way else M_hand
-    return Operators(
-        E=parts["identity_E"] + S_v.T @ M_hand @ S_v + M,
-        A=A,
-        B=S_v.T.copy(),
-        F=F,
-        S_q=S_q,
-        S_v=S_v,
-        energy=energy,
-        total=symmetric(energy + S_v.T @ hand @ S_v + ((cross + cross.T) if p.two_way else 0.0)),
+    return EnergySystem(
+        parts["identity_E"] + S_v.T @ M_hand @ S_v + M,
+        A,
+        S_v.T.copy(),
+        outputs.C_z + outputs.C_s @ S_q,
+        p.load(F),
+        S_q,
+        S_v,
+        outputs.names,
+        name=name,
+        C_s=outputs.C_s,
+        H_tissue=energy,
+        H=symmetric(energy + S_v.T @ hand @ S_v + ((cross + cross.T) if p.two_way else 0.0)),
+        two_way=p.two_way,
+        structured=p.conservative and second_order,
+        scale=p.scale,
     )

@@ -2,171 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.material import LayerMaterial, in_words
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.shown import Card, Shown, amount, drawn, listed
-from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError, Structure
-from softgrasp.reduction.canonical import canonical_operators
-from softgrasp.reduction.galerkin import galerkin_operators
-from softgrasp.reduction.lti import LTI, make_lti
-from softgrasp.reduction.operators import Operators, Parameters, Parts, Reconstruction
-from softgrasp.reduction.spectrum import Spectrum, spectrum
+from softgrasp.fem.shown import Card, Shown, drawn, listed
+from softgrasp.reduction.bases.basis import Coordinates, Frame, Structure
+from softgrasp.reduction.canonical import canonical_system
+from softgrasp.reduction.galerkin import galerkin_system
+from softgrasp.reduction.operators import Parameters, Parts, Reconstruction
+from softgrasp.reduction.system import EnergySystem, ModelError, Outputs
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
     from softgrasp.fem.run.trajectory import Trajectory
-
-
-class ModelError(ReductionError):
-    """A reduced model cannot be made, or is asked for what it does not hold."""
-
-
-class UnstableModelError(SoftgraspError):
-    """A reduced model with growing modes was about to be run."""
-
-
-def singular(X: Array) -> bool:
-    """Whether a square matrix is singular to rounding once its rows and columns are balanced."""
-    sizes = np.abs(X)
-    rows, columns = (np.sqrt(np.where(m > 0, m, 1.0)) for m in (sizes.max(axis=1), sizes.max(axis=0)))
-    values = np.linalg.svd(X / np.outer(rows, columns), compute_uv=False)
-    return bool(values[-1] <= 4 * len(X) * np.finfo(float).eps * values[0])
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """y = C_z x + C_s q_s, the scene's outputs [m]."""
-
-    C_z: Array  # part of the tissue relative to the hand, (p, N)
-    C_s: Array  # rigid part, (p, n_s)
-    names: tuple[str, ...] = ()  # one per component
-
-
-@dataclass(frozen=True, repr=False)
-class ReducedSystem(Shown):
-    """E x' = A x + B u + f, q_s = S_q x, v_s = S_v x, y = C_z x + C_s q_s at one parameter, of dimension N.
-
-    Everything that a run needs, nothing of full order. The state x has no unit of its own: with fixed solid modes its
-    first 2 n_s entries are q_s [m, rad] and v_s [m/s, rad/s].
-    """
-
-    name: str  # of the basis
-    operators: Operators  # E, A (N, N), B (N, n_s), readouts of the hand and energies
-    f: Array  # load of gravity, (N,)
-    outputs: Outputs  # C_z (p, N) and C_s (p, n_s) [m]
-    M_hand: Array  # hand mass matrix, (n_s, n_s) [kg, kg m^2]
-    fixed_solid: bool  # the first 2 n_s coordinates are q_s and v_s
-    two_way: bool  # the hand feels the tissue
-    structured: bool  # without damping the model conserves its energy by construction
-    scale: float = 1.0  # density over that of the projection (canonical models, else 1)
-
-    def card(self) -> Card:
-        """Dimension, stability and outputs."""
-        rows = (
-            ("dimension", f"N = {self.N}, hand {self.n_s}"),
-            ("stable", self.verdict()),
-            ("outputs", listed(self.outputs.names)),
-        )
-        return Card(f"ReducedSystem {self.name}", rows)
-
-    def verdict(self) -> str:
-        """Whether the system is stable, with the largest real part of an eigenvalue, or why there is none."""
-        try:
-            return f"{'yes' if self.stable else 'no'}, spectral abscissa {amount(self.spectral_abscissa, '1/s')}"
-        except ModelError as error:
-            return f"unknown: {error}"
-
-    @property
-    def N(self) -> int:
-        """Dimension of the first-order model."""
-        return len(self.operators.A)
-
-    @property
-    def n_s(self) -> int:
-        """Degrees of freedom of the hand."""
-        return len(self.M_hand)
-
-    @property
-    def inner(self) -> slice:
-        """Coordinates whose equations decide on stability: the tissue's own where the hand does not feel it."""
-        return slice(2 * self.n_s if self.fixed_solid and not self.two_way else 0, self.N)
-
-    @cached_property
-    def spectrum(self) -> Spectrum:
-        """Eigenvalues without the exact zeros of the free hand.
-
-        Raises:
-            ModelError: E is singular, as with linearly dependent columns.
-        """
-        self.check_independent()
-        inner, op = self.inner, self.operators
-        Q = op.energy if inner.start else op.total
-        result = spectrum(op.E[inner, inner], op.A[inner, inner], Q[inner, inner], self.structured)
-        return replace(result, zeros=self.N - len(result.eigenvalues))
-
-    def check_independent(self) -> None:
-        """Refuse a singular E, which LAPACK need not notice.
-
-        Raises:
-            ModelError: E is singular to rounding, as with linearly dependent columns.
-        """
-        if not np.isfinite(self.operators.E).all():
-            raise ModelError("the reduced matrices are not finite; check basis and materials", self.name)
-        if singular(self.operators.E):
-            raise ModelError(
-                "the reduced E is singular; its basis vectors are linearly dependent, take fewer", self.name
-            )
-
-    @property
-    def spectral_abscissa(self) -> float:
-        """Largest real part of an eigenvalue, apart from the exact zeros of the free hand [1/s]."""
-        return self.spectrum.abscissa
-
-    @property
-    def stable(self) -> bool:
-        """No eigenvalue right of the axis beyond the tolerance, :data:`softgrasp.reduction.spectrum.GROWTH_TOLERANCE`.
-
-        The double zero of the free hand (it drifts at constant velocity) does not count.
-        """
-        return self.spectrum.stable
-
-    def energy(self, x: Array) -> Array:
-        """Tissue energy (z' K z + v_z' M v_z) / 2 of states (..., N) [J]."""
-        return np.asarray(np.einsum("...i,...i->...", x @ self.operators.energy, x) / 2)
-
-    def total_energy(self, x: Array) -> Array:
-        """Energy with that of the hand's motion, of states (..., N) [J]; two-way it is the Hamiltonian."""
-        return np.asarray(np.einsum("...i,...i->...", x @ self.operators.total, x) / 2)
-
-    def lti(self) -> LTI:
-        """The system from the hand's load u to the scene's outputs; with ``to_control`` and ``to_pymor``."""
-        op, C = self.operators, self.outputs.C_z + self.outputs.C_s @ self.operators.S_q
-        return make_lti(op.E, op.A, op.B, C, self.outputs.names, self.fixed_solid)
-
-    def equilibrium(self) -> Array:
-        """State at rest under gravity with the hand at the origin, (N,).
-
-        Raises:
-            ModelError: the hand is not fixed, so that the model has no such coordinates, or there is no such state, or
-                more than one.
-        """
-        if not self.fixed_solid:
-            raise ModelError("an equilibrium needs a basis with fixed solid modes", self.name)
-        k = 2 * self.n_s
-        x = np.zeros(self.N)
-        if self.f.any():
-            A = self.operators.A[k:, k:]
-            if singular(A):  # as with more displacements than velocities in the basis
-                raise ModelError("the basis has no single equilibrium under gravity; take another N", self.name)
-            x[k:] = -np.linalg.solve(A, self.f[k:])
-        return x
 
 
 @dataclass(frozen=True, repr=False)
@@ -174,7 +26,7 @@ class ReducedModel(Shown):
     """E x' = A x + B u + F g for all lambda, mu, rho of every layer: a new parameter costs no full-order work.
 
     The matrices are sums over the layers, A = A_0 + sum_l lambda_l A_lambda,l + mu_l A_mu,l and so on, which
-    :meth:`at` assembles; a run needs the :class:`ReducedSystem` that it returns.
+    :meth:`at` assembles; a run needs the :class:`EnergySystem` that it returns.
     """
 
     name: str
@@ -236,7 +88,7 @@ class ReducedModel(Shown):
         """
         return drawn("model_errors", self, model, run)
 
-    def at(self, materials: tuple[LayerMaterial, ...] | None = None, gravity: Array | None = None) -> ReducedSystem:
+    def at(self, materials: tuple[LayerMaterial, ...] | None = None, gravity: Array | None = None) -> EnergySystem:
         """Assemble E x' = A x + B u + F g at new materials and gravity. Online; not collective.
 
         A (q, v) model is affine in mu, lambda, rho, beta mu and beta lambda of each layer. A canonical one needs
@@ -249,32 +101,12 @@ class ReducedModel(Shown):
         Raises:
             ModelError: materials that the parts cannot represent.
         """
-        materials = self.materials if materials is None else materials
-        p = self.parameters(materials)
+        p = self.parameters(self.materials if materials is None else materials, gravity)
         if self.coordinates == "qv":
-            operators = galerkin_operators(self.parts, p)
-        else:
-            operators = canonical_operators(self.parts, p, self.fixed_solid, self.frame == "absolute")
-        g = self.gravity if gravity is None else np.asarray(gravity, dtype=float)
-        conservative = not p.damped or (p.alpha == 0 and all(m.beta == 0 for m in materials))
-        kept = self.coordinates == "qp" or self.structure == "second_order"
-        return ReducedSystem(
-            name=self.name,
-            operators=operators,
-            f=np.zeros(self.N) if g is None else operators.F @ g,
-            outputs=self.outputs,
-            M_hand=self.parts["M_hand"],
-            fixed_solid=self.fixed_solid,
-            two_way=self.two_way,
-            structured=conservative and kept,
-            scale=p.scale,
-        )
+            return galerkin_system(self.name, self.parts, p, self.outputs, self.structure == "second_order")
+        return canonical_system(self.name, self.parts, p, self.outputs, self.fixed_solid, self.frame == "absolute")
 
-    def lti(self, materials: tuple[LayerMaterial, ...] | None = None) -> LTI:
-        """The linear time-invariant system at some materials, see :meth:`ReducedSystem.lti`; as for :meth:`at`."""
-        return self.at(materials).lti()
-
-    def parameters(self, materials: tuple[LayerMaterial, ...]) -> Parameters:
+    def parameters(self, materials: tuple[LayerMaterial, ...], gravity: Array | None = None) -> Parameters:
         """Check materials and bundle them with the effects of the scene.
 
         Raises:
@@ -301,9 +133,10 @@ class ReducedModel(Shown):
                     "a canonical model holds M_ee^-1 and takes densities that all change by one factor; "
                     "project again, or use a (q, v) model"
                 )
-        return Parameters(materials, self.alpha, self.damped, self.in_space, self.hand_weight, self.two_way, scale)
+        g = self.gravity if gravity is None else np.asarray(gravity, dtype=float)
+        return Parameters(materials, g, self.alpha, self.damped, self.in_space, self.hand_weight, self.two_way, scale)
 
-    def reconstruct(self, small: ReducedSystem, x: Array, v_s: Array | None = None) -> tuple[Array, Array]:
+    def reconstruct(self, small: EnergySystem, x: Array, v_s: Array | None = None) -> tuple[Array, Array]:
         """Relative tissue states of reduced states x (N, m): z and v_z, local rows (n_local, m).
 
         Args:
@@ -321,5 +154,5 @@ class ReducedModel(Shown):
         if small.scale != 1.0:
             v_z /= small.scale
         if reconstruction.W_G is not None:
-            v_z -= reconstruction.W_G @ (small.operators.S_v @ x if v_s is None else v_s)
+            v_z -= reconstruction.W_G @ (small.S_v @ x if v_s is None else v_s)
         return z, v_z

@@ -13,8 +13,8 @@ from softgrasp.fem.labelled import Labelled, Quantity, of_hand
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.reduced import march_together
 from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
-from softgrasp.reduction.model import ModelError, ReducedSystem, UnstableModelError
 from softgrasp.reduction.propagator import Propagator, propagator
+from softgrasp.reduction.system import EnergySystem, ModelError, UnstableModelError
 
 # byte of the matrices of a batch up to which all models step together; somewhere between 4 and 11 MB they leave the
 # cache, and one model after the other is faster (docs/benchmarks.md)
@@ -66,7 +66,7 @@ def _check_stable(step: Propagator, allow_unstable: bool) -> None:
 
 
 def run(
-    model: ReducedSystem | Propagator,
+    model: EnergySystem | Propagator,
     dt: float | None = None,
     force: Array | None = None,
     hand: tuple[Array, Array] | None = None,
@@ -102,9 +102,9 @@ def run(
     return trajectory(step, w, hand)
 
 
-def prepared(model: ReducedSystem | Propagator, dt: float | None, driven: bool) -> Propagator:
+def prepared(model: EnergySystem | Propagator, dt: float | None, driven: bool) -> Propagator:
     """A propagator for the kind of input; checks one that was made beforehand."""
-    if isinstance(model, ReducedSystem):
+    if isinstance(model, EnergySystem):
         if dt is None:
             raise ModelError("give the time step dt [s]")
         return propagator(model, dt, driven)
@@ -129,7 +129,7 @@ def checked_hand(hand: tuple[Array, Array], n_s: int) -> tuple[Array, Array]:
     return q, v
 
 
-def hand_inputs(model: ReducedSystem, hand: tuple[Array, Array], dt: float) -> Array:
+def hand_inputs(model: EnergySystem, hand: tuple[Array, Array], dt: float) -> Array:
     """Mean position, velocity and acceleration of each step from tables (steps + 1, n_s); (steps, 3 n_s)."""
     q, v = checked_hand(hand, model.n_s)
     q = consistent(q, v, dt)
@@ -138,14 +138,15 @@ def hand_inputs(model: ReducedSystem, hand: tuple[Array, Array], dt: float) -> A
 
 def trajectory(step: Propagator, w: Array, hand: tuple[Array, Array] | None) -> ReducedTrajectory:
     """Bundle states w (steps + 1, k) with the hand, prescribed or of the states, and the outputs."""
-    model, op, x = step.model, step.model.operators, w @ step.at.X.T
+    model, x = step.model, w @ step.at.X.T
     if hand is None:
-        q, v = x @ op.S_q.T, x @ op.S_v.T
+        q, v = x @ model.S_q.T, x @ model.S_v.T
+        y = x @ model.C.T
     else:
         q, v = hand
         x = np.hstack([consistent(q, v, step.dt), v, x])
-    y = x @ model.outputs.C_z.T + q @ model.outputs.C_s.T
-    return ReducedTrajectory(step.dt * np.arange(float(len(x))), x, q, v, y, model.outputs.names)
+        y = x @ model.C.T + (q - x[:, : model.n_s]) @ model.C_s.T
+    return ReducedTrajectory(step.dt * np.arange(float(len(x))), x, q, v, y, model.names)
 
 
 class Stepper:
@@ -158,7 +159,7 @@ class Stepper:
 
     def __init__(
         self,
-        model: ReducedSystem | Propagator,
+        model: EnergySystem | Propagator,
         dt: float | None = None,
         x0: Array | None = None,
         allow_unstable: bool = False,
@@ -166,8 +167,7 @@ class Stepper:
         self.step = prepared(model, dt, False)
         _check_stable(self.step, allow_unstable)
         model = self.step.model
-        k, op = self.step.size, model.operators
-        C = model.outputs.C_z + model.outputs.C_s @ op.S_q
+        k, C = self.step.size, model.C
         # new state, and outputs of the new state, in one product
         self._matrix = np.ascontiguousarray(np.vstack([self.step.matrix, C @ self.step.at.X @ self.step.matrix]))
         self._row = np.zeros(self._matrix.shape[1])
@@ -194,7 +194,7 @@ class Stepper:
 
 
 def run_batch(
-    models: Sequence[ReducedSystem | Propagator],
+    models: Sequence[EnergySystem | Propagator],
     dt: float,
     forces: Array | None = None,
     allow_unstable: bool = False,

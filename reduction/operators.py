@@ -59,12 +59,22 @@ class Parameters:
     """Everything online assembly depends on."""
 
     materials: tuple[LayerMaterial, ...]  # one per layer
+    gravity: Array | None = None  # acceleration of free fall in the hand's degrees of freedom, (n_s,) [m/s^2]
     alpha: float = 0.0  # mass-proportional damping [1/s]
     damped: bool = False  # damping terms exist
     in_space: bool = False  # alpha drags the rigid motion too
     hand_weight: bool = False  # gravity acts on the hand's own mass
     two_way: bool = False  # the hand feels the tissue
     scale: float = 1.0  # rho / rho of the projection, common to all layers (canonical models)
+
+    @property
+    def conservative(self) -> bool:
+        """Whether nothing damps."""
+        return not self.damped or (self.alpha == 0 and all(m.beta == 0 for m in self.materials))
+
+    def load(self, F: Array) -> Array:
+        """F = F g, (N,), of the matrix F (N, n_s) that maps an acceleration of the hand."""
+        return np.zeros(len(F)) if self.gravity is None else np.asarray(F @ self.gravity)
 
     def _sum(self, weights: list[float], stack: Array) -> Array:
         # one product of a vector with a reshaped stack: an order of magnitude faster than a loop for small matrices
@@ -83,17 +93,3 @@ class Parameters:
         return self._sum([m.beta * m.mu for m in self.materials], mu) + self._sum(
             [m.beta * m.lam for m in self.materials], lam
         )
-
-
-@dataclass(frozen=True)
-class Operators:
-    """E x' = A x + B u + F g of dimension N, its hand and its energies."""
-
-    E: Array  # mass-like matrix, (N, N)
-    A: Array  # system matrix, (N, N)
-    B: Array  # input of the force u on the hand, (N, n_s)
-    F: Array  # input of the acceleration of free fall g, (N, n_s)
-    S_q: Array  # displacement of the hand, q_s = S_q x, (n_s, N)
-    S_v: Array  # velocity of the hand, v_s = S_v x, (n_s, N)
-    energy: Array  # x' energy x / 2 is the tissue's energy (z' K z + v_z' M v_z) / 2 [J]
-    total: Array  # ``energy`` with the hand's kinetic energy; two-way also of the rigid motion: the Hamiltonian [J]

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from softgrasp.fem.errors import shortened
-from softgrasp.reduction.model import ModelError
+from softgrasp.reduction.system import ModelError
 
 Origin = Mapping[str, Any]
 """Value of every key that decides on a run, a file by the hash of what it holds; nothing that is off or at rest."""

@@ -14,8 +14,9 @@ from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.canonical import canonical_parts
 from softgrasp.reduction.galerkin import galerkin_parts
-from softgrasp.reduction.model import Outputs, ReducedModel
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.operators import Reconstruction
+from softgrasp.reduction.system import Outputs
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.outputs import Output

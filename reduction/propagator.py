@@ -22,8 +22,8 @@ import numpy as np
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.reduced import MidpointSteps
-from softgrasp.reduction.model import ModelError, ReducedSystem
 from softgrasp.reduction.spectrum import NULL_TOLERANCE, balanced, energy_factor, is_skew, skew_modes
+from softgrasp.reduction.system import EnergySystem, ModelError
 
 SLOW = 0.01  # sine or cosine below which one unit in the last place of the other turns by 1e-12 of the angle
 TURNS = 32  # angles whose sine and cosine are computed; the others are products of two of them
@@ -138,7 +138,7 @@ class Propagator(MidpointSteps):
     A conservative model also has ``modal``, which runs without a matrix of the steps.
     """
 
-    model: ReducedSystem  # what it steps
+    model: EnergySystem  # what it steps
     at: StepCoordinates  # coordinates, x = X w
     driven: bool = False  # the hand is prescribed: w holds the tissue only, and the inputs are the hand's in a step
     modal: Modal | None = None  # the step mode by mode, for conservative models
@@ -155,20 +155,20 @@ class Propagator(MidpointSteps):
     def exact(self, P: Array, steps: int) -> Array:
         """Entries of P^steps that are known: rotations, and the free hand."""
         self.at.fix(P, steps * 2 * np.arctan(self.at.omega * self.dt / 2), steps in (1, self.steps))
-        if self.model.fixed_solid and not (self.model.two_way or self.driven):
+        if self.model.hand_first and not (self.model.two_way or self.driven):
             k = 2 * self.model.n_s
             P[:k] = 0.0
             P[:k, :k] = np.eye(k) + np.diag(np.full(self.model.n_s, steps * self.dt), self.model.n_s)
         return P
 
 
-def _coordinates(model: ReducedSystem, driven: bool) -> StepCoordinates:
+def _coordinates(model: EnergySystem, driven: bool) -> StepCoordinates:
     """Energy coordinates: of the tissue alone where the hand is driven, else of the whole state."""
-    apart, k, N = model.fixed_solid and (driven or not model.two_way), 2 * model.n_s, model.N
+    apart, k, N = model.hand_first and (driven or not model.two_way), 2 * model.n_s, model.N
     whole = None if apart or not model.structured else _whole(model)
     if whole is not None:
         return whole
-    tissue = _tissue(model, apart) if model.fixed_solid else None
+    tissue = _tissue(model, apart) if model.hand_first else None
     if driven and tissue is not None:
         return tissue
     X, X_inverse = np.eye(N), np.eye(N)
@@ -178,10 +178,10 @@ def _coordinates(model: ReducedSystem, driven: bool) -> StepCoordinates:
     return StepCoordinates(X, X_inverse, tissue.omega, k)
 
 
-def _tissue(model: ReducedSystem, apart: bool) -> StepCoordinates:
+def _tissue(model: EnergySystem, apart: bool) -> StepCoordinates:
     """Coordinates of the tissue beside the hand's own; ``apart`` if no hand moves with it, so that it has modes."""
-    op, block = model.operators, slice(2 * model.n_s, model.N)
-    E, A, L = op.E[block, block], op.A[block, block], energy_factor(op.energy[block, block])
+    block = slice(2 * model.n_s, model.N)
+    E, A, L = model.E[block, block], model.A[block, block], energy_factor(model.H_tissue[block, block])
     if L is None:
         return StepCoordinates(np.eye(len(A)), np.eye(len(A)), np.zeros(0))
     U, omega = np.eye(len(L)), np.zeros(0)
@@ -194,22 +194,22 @@ def _tissue(model: ReducedSystem, apart: bool) -> StepCoordinates:
     return StepCoordinates(np.linalg.solve(L.T, U), U.T @ L.T, omega, 0, still)
 
 
-def _whole(model: ReducedSystem) -> StepCoordinates | None:
+def _whole(model: EnergySystem) -> StepCoordinates | None:
     """Coordinates w = [modes; still; free] of a conservative model with its hand inside, H = |modes, still|^2 / 2.
 
     H is semidefinite: displacements of the free hand cost nothing. With H = y'y / 2, y = R x and y' = R E^-1 A R^+ y, a
     skew matrix, whose null vectors stand still (a hand that coasts). The null space of H is moved but moves nothing.
     None when the numbers do not show the structure.
     """
-    op = model.operators
-    D = np.sqrt(np.abs(np.diag(op.total)))
+    H = model.H
+    D = np.sqrt(np.abs(np.diag(H)))
     D = np.where(D > 0, D, 1.0)
-    values, V = np.linalg.eigh(op.total / np.outer(D, D))
+    values, V = np.linalg.eigh(H / np.outer(D, D))
     keep = values > NULL_TOLERANCE * values.max(initial=0.0)
     root, V_r, V_0 = np.sqrt(values[keep]), V[:, keep], V[:, ~keep]
     R, R_plus = root[:, None] * V_r.T * D, V_r / D[:, None] / root
     # A = R'R of a canonical model: A R^+ = R', without the rounding of A over a small root
-    S = R @ np.linalg.solve(op.E, R.T if np.array_equal(op.A, op.total) else op.A @ R_plus)
+    S = R @ np.linalg.solve(model.E, R.T if np.array_equal(model.A, H) else model.A @ R_plus)
     if not is_skew(S):
         return None
     U, omega = skew_modes((S - S.T) / 2)
@@ -217,7 +217,7 @@ def _whole(model: ReducedSystem) -> StepCoordinates | None:
     return StepCoordinates(X, X_inverse, omega, 0, len(root) - 2 * len(omega))
 
 
-def propagator(model: ReducedSystem, dt: float, driven: bool = False) -> Propagator:
+def propagator(model: EnergySystem, dt: float, driven: bool = False) -> Propagator:
     """Precompute a step of size dt. Online; not collective.
 
     Args:
@@ -228,18 +228,18 @@ def propagator(model: ReducedSystem, dt: float, driven: bool = False) -> Propaga
     Raises:
         ModelError: E or the midpoint matrix is singular, or ``driven`` without fixed solid modes.
     """
-    op, k = model.operators, 2 * model.n_s
-    if driven and not model.fixed_solid:
+    k = 2 * model.n_s
+    if driven and not model.hand_first:
         raise ModelError("the hand is inside the basis, so it cannot be prescribed; give a force", model.name)
     model.check_independent()
     at, tissue = _coordinates(model, driven), slice(k, model.N)
-    E, A, n_s = op.E, op.A, model.n_s
+    E, A, n_s = model.E, model.A, model.n_s
     if driven:
         # E_yq q_s' with q_s' = mean v_s, E_yv v_s' with v_s' = mean a_s
         inputs = np.hstack([A[tissue, :n_s], A[tissue, n_s:k] - E[tissue, :n_s], -E[tissue, n_s:k]])
         f, E, A = model.f[tissue], E[tissue, tissue], A[tissue, tissue]
     else:
-        inputs, f = op.B, model.f
+        inputs, f = model.B, model.f
     loads = np.hstack([inputs, f[:, None]])
     modal = modal_of(at, E, A, loads, dt)
     step = Propagator(dt, E @ at.X, A @ at.X, loads, model, at, driven, modal)

@@ -16,10 +16,11 @@ from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.reduction import online
 from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.errors import ModelComparison, ModelErrors, full_energy, shown_rows, state_rows, with_hand
-from softgrasp.reduction.model import ReducedModel, ReducedSystem
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.origin import Origin, check_origin
 from softgrasp.reduction.propagator import Propagator, propagator
+from softgrasp.reduction.system import EnergySystem
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
@@ -118,21 +119,21 @@ def comparison_of(rom: ReducedModel, full: FullRun) -> ModelComparison:
     return ModelComparison(rom, rom.at(system.materials), system, full.snapshots, full.energy)
 
 
-def replay_inputs(rom: ReducedModel, small: ReducedSystem, full: FullRun) -> tuple[Propagator, dict[str, Any]]:
+def replay_inputs(rom: ReducedModel, small: EnergySystem, full: FullRun) -> tuple[Propagator, dict[str, Any]]:
     """Propagator, and keywords of :func:`softgrasp.reduction.online.run`, that repeat a full run. Collective.
 
     ``small``: the same at the materials of the run that is to be made.
 
     Raises ModelError: E or the midpoint matrix is singular, or there is no single equilibrium to start in.
     """
-    drive: dict[str, Any] = {"hand": full.hand} if small.fixed_solid else {"force": full.force}
-    step = propagator(small, full.dt, driven=small.fixed_solid)
+    drive: dict[str, Any] = {"hand": full.hand} if small.hand_first else {"force": full.force}
+    step = propagator(small, full.dt, driven=small.hand_first)
     if full.model.scene.time.start == "equilibrium":
-        drive["x0"] = small.equilibrium() if small.fixed_solid else nearest_state(rom, small, full)
+        drive["x0"] = small.equilibrium() if small.hand_first else nearest_state(rom, small, full)
     return step, drive
 
 
-def nearest_state(rom: ReducedModel, small: ReducedSystem, full: FullRun) -> Array:
+def nearest_state(rom: ReducedModel, small: EnergySystem, full: FullRun) -> Array:
     """State x that shows the first snapshot best, min_x |V x - X_0|, (N,). Collective."""
     system, snapshots, first = full.model.system, full.snapshots, slice(0, 1)
     n, Z, q_s, v_s = system.layout.n_local, snapshots.Z[:, first], snapshots.q_s[:, first], snapshots.v_s[:, first]

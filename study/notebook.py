@@ -18,10 +18,10 @@ from softgrasp.fem.columns import Array, OutputColumn
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
 from softgrasp.fem.model.build import Model
+from softgrasp.fem.reduced import ReducedSystem
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.loop.margins import LoopMargins
-from softgrasp.reduction.lti import LTI
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.reduce import errors, replay
@@ -66,12 +66,12 @@ def _space(run: Trajectory | LoopTrajectory) -> int:
     return 3 if any(column.axis == "z" for column in run.columns) else 2
 
 
-def lti_bode(system: LTI) -> Any:
+def system_bode(system: ReducedSystem) -> Any:
     """Gain |C (i w E - A)^-1 B| and phase from each input to each output. Not collective."""
     sizes = np.abs(scipy.linalg.eigvals(system.A, system.E))
     sizes = sizes[np.isfinite(sizes) & (sizes > 1e-8 * sizes.max())]  # without the free hand
     omega = np.geomspace(0.1 * sizes.min(), 10 * sizes.max(), FREQUENCIES)
-    H = system.at(1j * omega)
+    H = system.transfer(1j * omega)
     with paper_style():
         figure, (gain, phase) = plt.subplots(2, 1, figsize=(WIDTH, 0.6 * WIDTH), sharex=True, layout="constrained")
         for k, (i, j) in enumerate(np.ndindex(H.shape[1:])):

@@ -33,7 +33,7 @@ def objects() -> dict[str, Any]:
     strained_run = sg.simulate(strained)
     strain_model = sg.reduce(strained, strained_run, N=14)
     return {
-        "scene": model.scene, "model": model, "run": run, "rom": rom, "system": rom.at(), "lti": rom.lti(),
+        "scene": model.scene, "model": model, "run": run, "rom": rom, "system": rom.at(),
         "replay": sg.replay(rom, model, run), "design": design, "controller": controller,
         "margins": loop_margins(controller), "problem": design.problem, "solution": design.solution, "loop": loop,
         "strained_run": strained_run, "strain_model": strain_model,
@@ -62,7 +62,9 @@ def test_cards_hold_the_numbers_of_the_objects(objects: dict[str, Any]) -> None:
     assert rows["unknowns"] == f"hand 2, tissue {objects['model'].system.layout.n_e}, {objects['model'].states} states"
     assert rows["effects"] == "damping"
     assert "2D, P1, 64 cells" in repr(objects["model"])  # 4 x 8 boxes of two triangles
-    poles = np.linalg.eigvals(np.linalg.solve(objects["lti"].E, objects["lti"].A)[4:, 4:])  # without the free hand
+    poles = np.linalg.eigvals(
+        np.linalg.solve(objects["system"].E, objects["system"].A)[4:, 4:]
+    )  # without the free hand
     assert f"spectral abscissa {poles.real.max():.3g} 1/s" in repr(objects["system"])
 
 
@@ -92,9 +94,9 @@ def test_figures_show_what_the_objects_hold(objects: dict[str, Any], tmp_path: P
     )
     np.testing.assert_array_equal(objects["loop"].plot().axes[0].lines[0].get_ydata(), objects["loop"].outputs[:, 0])
     assert len(objects["margins"].plot().axes) == 2
-    gain = objects["lti"].bode().axes[0].lines[0]
+    gain = objects["system"].bode().axes[0].lines[0]
     omega = gain.get_xdata()[100]
-    E, A, B, C = (getattr(objects["lti"], name) for name in "EABC")
+    E, A, B, C = (getattr(objects["system"], name) for name in "EABC")
     exact = abs(C @ np.linalg.solve(1j * omega * E - A, B))[0, 0]
     assert gain.get_ydata()[100] == pytest.approx(exact, rel=1e-9)  # two orders of the same sums
     _, error = rom.plot_errors(objects["model"], run).axes

@@ -126,8 +126,10 @@ class Time(Section):
         "rest", description="start undeformed, or in equilibrium under gravity [no unit]"
     )
     solver: Literal["auto", "cholesky", "mumps", "cg", "stars"] = Field("auto", description="linear solver [no unit]")
-    rtol: Annotated[float, Field(gt=0, lt=1)] = Field(
-        1e-4, description="relative tolerance [1] of each step with cg or stars; energy is exact at any"
+    rtol: Dropped[Annotated[float, Field(gt=0, lt=1)]] = Field(
+        None,
+        description="relative residual [1] at which cg or stars ends a step; default 1e-8 with cg, 1e-4 with stars and "
+        "at finite strain; energy is exact at any",
     )
     reproducible: Literal["auto"] | bool = Field(
         "auto",
@@ -314,5 +316,6 @@ def check_dimension(scene: Scene, d: int) -> None:
 def scene_schema() -> dict[str, Any]:
     """JSON schema of a scene file, draft 2020-12."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema(by_alias=True)
-    schema["$defs"]["Reduction"]["properties"]["methods"]["items"]["enum"] = list(BASES)
+    own = {"type": "string", "description": "a basis of reduction.plugins"}
+    schema["$defs"]["Reduction"]["properties"]["methods"]["items"] = {"anyOf": [{"enum": list(BASES)}, own]}
     return schema

@@ -16,9 +16,8 @@ from softgrasp.fem.errors import no_pipe, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.reduced import midpoint_map
+from softgrasp.fem.reduced import ReducedSystem, midpoint_map
 from softgrasp.fem.shown import Card, Shown, amount, counted, listed
-from softgrasp.lqr.loop.small import SmallPlant
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 
@@ -74,7 +73,7 @@ class Controller(Shown):
     """Reduced state at the target, (N,)."""
     u_bar: Array
     """Steady input at the target [N, N m], (n_s,)."""
-    plant: SmallPlant
+    plant: ReducedSystem
     """Reduced plant that K was made for."""
     period: float = 1e-3
     """Time between two calls of ``step`` [s]."""
@@ -182,14 +181,14 @@ class Controller(Shown):
         """
         meta, arrays = read_npz(Path(path), {"scene_hash": scene_hash, "layout_hash": layout_hash})
         try:
-            plant = SmallPlant(**{key: arrays[f"plant_{key}"] for key in PLANT}, names=tuple(meta["names"]))
+            plant = ReducedSystem(**{key: arrays[f"plant_{key}"] for key in PLANT}, names=tuple(meta["names"]))
             about = {key: meta[key] for key in ("period", "scene_hash", "layout_hash", "about")}
             return cls(arrays["K"], arrays["x_bar"], arrays["u_bar"], plant, limits=arrays.get("limits"), **about)
         except KeyError as error:
             raise ControlError(f"{path} holds no controller ({error} is missing); save it again") from error
 
 
-def _tissue_step(plant: SmallPlant, period: float) -> tuple[Array, Array, Array | None, Array]:
+def _tissue_step(plant: ReducedSystem, period: float) -> tuple[Array, Array, Array | None, Array]:
     """Midpoint rule of the tissue rows of the plant for a hand whose velocity is known.
 
     y_{k+1} = step y_k + accelerated (v_{k+1} - v_k) [+ dragged (v_{k+1} + v_k)] + constant

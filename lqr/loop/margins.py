@@ -18,9 +18,9 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.reduced import ReducedSystem
 from softgrasp.fem.shown import Card, Shown, drawn
 from softgrasp.lqr.loop.controller import Controller
-from softgrasp.reduction.lti import LTI
 
 POINTS = 4000  # frequencies, spaced evenly in log w: 0.3 % apart over five decades
 NEAR = 60  # more around each resonance, where the phase turns at once
@@ -67,7 +67,7 @@ class LoopMargins(Shown):
         return 1 / (1 + a), 1 / (1 - a) if a < 1 else np.inf, float(np.degrees(2 * np.arcsin(a / 2)))
 
 
-def sampled(plant: LTI, period: float) -> tuple[Array, Array]:
+def sampled(plant: ReducedSystem, period: float) -> tuple[Array, Array]:
     """A_d (N, N) and B_d (N, n_s) of the plant under a load that is held for a period [s]."""
     N, m = plant.B.shape
     solved = np.linalg.solve(plant.E, np.hstack([plant.A, plant.B]))
@@ -82,7 +82,7 @@ def loop_margins(controller: Controller, delay: int = 0) -> LoopMargins:
         controller: gain, plant and period; its limits are left out.
         delay: ticks between a sample and its load.
     """
-    plant, h, K = controller.plant.lti(), controller.period, controller.K
+    plant, h, K = controller.plant, controller.period, controller.K
     A, B = sampled(plant, h)
     poles = np.concatenate([scipy.linalg.eigvals(M, plant.E) for M in (plant.A, plant.under(K).A)])
     omega = _grid(poles, np.pi / h)

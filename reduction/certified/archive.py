@@ -24,7 +24,7 @@ from softgrasp.reduction.certified.model import CertifiedModel, ParameterDomain
 from softgrasp.reduction.certified.motion import Drive
 from softgrasp.reduction.certified.oscillators import SecondOrder
 from softgrasp.reduction.certified.residual import ResidualNorms
-from softgrasp.reduction.model import ModelError
+from softgrasp.reduction.system import ModelError
 
 FORMAT = "softgrasp certified model 3"
 GROUP = "certificate"

@@ -19,11 +19,11 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial, in_words
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.shown import Card, Shown, listed
-from softgrasp.reduction.model import ModelError, Outputs
 from softgrasp.reduction.online import ReducedTrajectory, checked_hand
 from softgrasp.reduction.strain.cells import Cells, Potential
 from softgrasp.reduction.strain.indicator import Finer, estimated_error
 from softgrasp.reduction.strain.stepper import StrainProblem, march_strain
+from softgrasp.reduction.system import ModelError, Outputs
 
 TOLERANCE = 1e-10  # of a step's residual: the drift of a model's own energy stays near it
 SLACK = 1e-9  # of the edges of the box: rounding of the user's own arithmetic

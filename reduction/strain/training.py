@@ -34,7 +34,6 @@ from softgrasp.reduction.bases.inner import Rows, Weight
 from softgrasp.reduction.bases.pod import pod_part
 from softgrasp.reduction.bases.states import BasisError
 from softgrasp.reduction.errors import column_blocks, ratio
-from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.operators import Reconstruction, layer_products, symmetric
 from softgrasp.reduction.origin import origin_of
@@ -45,6 +44,7 @@ from softgrasp.reduction.strain.cells import Cells, Potential
 from softgrasp.reduction.strain.indicator import COLUMNS, Finer
 from softgrasp.reduction.strain.model import ReducedStrainSystem, StrainModel, StrainRun, TrainingDomain, coordinates
 from softgrasp.reduction.strain.nnls import nnls, on_one_rank
+from softgrasp.reduction.system import ModelError
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model

@@ -22,10 +22,10 @@ from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.bases.inner import orthonormality
 from softgrasp.reduction.bases.registry import make_bases, make_basis
 from softgrasp.reduction.bases.states import States, states_of
-from softgrasp.reduction.model import ReducedSystem
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, full_run
+from softgrasp.reduction.system import EnergySystem
 from tests.hardcases.cases import EPS, Family, HardCase, Outcome, here, make, qr_rounding, textbook, thin
 
 MOVE = 300  # steps of the move
@@ -142,19 +142,18 @@ def edge_rows(quick: bool) -> Iterator[HardCase]:
 # --- models that grow
 
 
-def textbook_loop(rom: ReducedSystem, dt: float, force: Array) -> Array:
+def textbook_loop(rom: EnergySystem, dt: float, force: Array) -> Array:
     """States of the midpoint rule on E x' = A x + B u as a textbook has it, unstable or not, (steps + 1, N)."""
-    op = rom.operators
-    lu = scipy.linalg.lu_factor(op.E - dt / 2 * op.A)
+    lu = scipy.linalg.lu_factor(rom.E - dt / 2 * rom.A)
     x = np.zeros(rom.N)
     states = [x]
     for u in force:
-        x = scipy.linalg.lu_solve(lu, (op.E + dt / 2 * op.A) @ x + dt * (op.B @ u))
+        x = scipy.linalg.lu_solve(lu, (rom.E + dt / 2 * rom.A) @ x + dt * (rom.B @ u))
         states.append(x)
     return np.array(states)
 
 
-def _energy_change(case: FullRun, rom: ReducedSystem, force: Array, checked: bool) -> float:
+def _energy_change(case: FullRun, rom: EnergySystem, force: Array, checked: bool) -> float:
     """Largest change of the energy after the move, where no force acts, over the largest energy of the run."""
     x = run(rom, case.dt, force=force).x if checked else textbook_loop(rom, case.dt, force)
     energy = rom.total_energy(x)
@@ -164,10 +163,10 @@ def _energy_change(case: FullRun, rom: ReducedSystem, force: Array, checked: boo
     return float(np.abs(free - free[0]).max() / np.abs(energy[: MOVE + 1]).max())
 
 
-def _rounding_of_energy(case: FullRun, rom: ReducedSystem, force: Array) -> float:
+def _rounding_of_energy(case: FullRun, rom: EnergySystem, force: Array) -> float:
     """N eps sqrt(steps), a random walk, times |x|'|H||x| / 2 over the largest energy: what its products cancel."""
     x = textbook_loop(rom, case.dt, force)[: MOVE + 1]
-    terms = np.einsum("ki,ij,kj->k", abs(x), abs(rom.operators.total), abs(x)).max() / 2
+    terms = np.einsum("ki,ij,kj->k", abs(x), abs(rom.H), abs(x)).max() / 2
     return math.sqrt(len(force)) * rom.N * EPS * float(terms / np.abs(rom.total_energy(x)).max())
 
 

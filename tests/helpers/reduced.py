@@ -17,9 +17,10 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Basis
-from softgrasp.reduction.model import ReducedModel, ReducedSystem
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory, run
 from softgrasp.reduction.projection import project
+from softgrasp.reduction.system import EnergySystem
 from tests.helpers.models import Array, gather_rows, make_scene
 
 KINDS = [(c, f, s) for c in ("qv", "qp") for f in ("absolute", "relative") for s in (True, False)]
@@ -127,10 +128,12 @@ def distance(system: BlockSystem, a: Array, b: Array) -> float:
     return float(np.sqrt(sums[0] / sums[1]))
 
 
-def small_of(model: Any, kind: tuple[Any, ...] = ("qp", "relative", True), pairs: int = 4) -> ReducedSystem:
+def small_of(model: Any, kind: tuple[Any, ...] = ("qp", "relative", True), pairs: int = 4) -> EnergySystem:
     """Small model of a symplectic basis of one kind."""
     coordinates, frame, fixed = kind
-    return reduced(model, symplectic_basis(model.system.layout, pairs, frame, fixed, coordinates)).at()
+    rom = reduced(model, symplectic_basis(model.system.layout, pairs, frame, fixed, coordinates))
+    assert rom.at().hand_first == rom.fixed_solid
+    return rom.at()
 
 
 def wiggle(steps: int, dt: float) -> Array:

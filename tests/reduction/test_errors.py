@@ -12,9 +12,9 @@ from mpi4py import MPI
 
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.errors import ModelComparison, full_energy
-from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.online import run
 from softgrasp.reduction.replay import full_run, replay_linear
+from softgrasp.reduction.system import ModelError
 from tests.helpers.models import Array, close, gather_matrix, gather_rows, gather_states
 from tests.helpers.reduced import (
     FORCED,
@@ -70,7 +70,7 @@ def test_errors_against_dense_matrices(comm: MPI.Intracomm, whole: bool) -> None
         # everything that the model can show
         eye = np.eye(small.N)
         shown = views(*(gather_rows(layout, part) for part in rom.reconstruct(small, eye)),
-                      small.operators.S_q, small.operators.S_v)  # fmt: skip
+                      small.S_q, small.S_v)  # fmt: skip
         for view, mine, X, V in zip(("velocities", "momenta"), found, exact, shown, strict=False):
             least = norm(X - V @ scipy.linalg.lstsq(V, X)[0]) / norm(X)
             projected = comparison.projection_error(view, rom, small)

@@ -14,10 +14,10 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import states_of
-from softgrasp.reduction.model import ModelError, ReducedSystem
 from softgrasp.reduction.online import run, run_batch
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.propagator import propagator, turns
+from softgrasp.reduction.system import EnergySystem, ModelError
 from tests.helpers.models import Array, close, make_scene
 from tests.helpers.reduced import DAMPED, KINDS, TINY, model_of, reduced, small_of, step_of, symplectic_basis, wiggle
 
@@ -25,16 +25,16 @@ FALL = {"effects": {"gravity": {"g": [1.0, -9.0]}}}
 CANONICAL = [kind for kind in KINDS if kind[0] == "qp"]
 
 
-def plain_driven(small: ReducedSystem, dt: float, hand: tuple[Array, Array], y: Array) -> Array:
+def plain_driven(small: EnergySystem, dt: float, hand: tuple[Array, Array], y: Array) -> Array:
     """E_yy y' + E_ys [v_s; a_s] = A_yy y + A_ys [q_s; v_s] + f by the midpoint rule as it is written."""
-    op, k, (q, v) = small.operators, 2 * small.n_s, hand
+    k, (q, v) = 2 * small.n_s, hand
     q = np.vstack([q[:1], q[0] + dt * np.cumsum((v[1:] + v[:-1]) / 2, axis=0)])
     s, states = np.hstack([q, v]), [y]
     for n in range(len(q) - 1):
         middle, rate = (s[n] + s[n + 1]) / 2, (s[n + 1] - s[n]) / dt
-        load = op.A[k:, :k] @ middle - op.E[k:, :k] @ rate + small.f[k:]
-        right = (op.E[k:, k:] + dt / 2 * op.A[k:, k:]) @ y + dt * load
-        y = np.linalg.solve(op.E[k:, k:] - dt / 2 * op.A[k:, k:], right)
+        load = small.A[k:, :k] @ middle - small.E[k:, :k] @ rate + small.f[k:]
+        right = (small.E[k:, k:] + dt / 2 * small.A[k:, k:]) @ y + dt * load
+        y = np.linalg.solve(small.E[k:, k:] - dt / 2 * small.A[k:, k:], right)
         states.append(y)
     return np.array(states)
 

@@ -17,9 +17,10 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.reduction.archive import write_checksums
 from softgrasp.reduction.certified.archive import save_certified
 from softgrasp.reduction.certified.training import certified_model
-from softgrasp.reduction.model import ModelError, ReducedModel
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.origin import differing
 from softgrasp.reduction.strain.model import StrainModel
+from softgrasp.reduction.system import ModelError
 
 BASE = (
     "tissue.cells=[4, 8]", "time.steps=40", "effects.gravity={g=[0, -9.81]}",

@@ -28,8 +28,8 @@ from softgrasp.reduction.certified.trainer import (
     train_key,
     validate,
 )
-from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import run_at
+from softgrasp.reduction.system import ModelError
 from softgrasp.study.reduce.certified.measure import REPEATS, check_box
 from softgrasp.study.reduce.certified.page import compose, shown
 from softgrasp.study.reduce.certified.result import BoxCheck

@@ -16,17 +16,18 @@ from softgrasp.fem.columns import hand_columns
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.reduced import ReducedSystem, ReducedSystemError
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.controller import Controller, layout_hash, load_gain, save_gain
 from softgrasp.lqr.loop.full import ClosedLoop
-from softgrasp.lqr.loop.small import ReducedLoop, Shapes, SmallPlant, galerkin
+from softgrasp.lqr.loop.small import Shapes, galerkin
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import hand_target, rest
-from softgrasp.reduction.bases.basis import ReductionError
 from tests.helpers.models import close, gather_rows, make_scene, same_everywhere
+from tests.helpers.small_loop import run_small
 
 Array = np.ndarray
 Q, R = 30.0, 0.5
@@ -61,7 +62,7 @@ def problem(model: Model) -> RiccatiProblem:
 
 
 @pytest.fixture(scope="module")
-def small(problem: RiccatiProblem) -> tuple[SmallPlant, Shapes, Array]:
+def small(problem: RiccatiProblem) -> tuple[ReducedSystem, Shapes, Array]:
     """Ten modes and the optimal gain of their plant, by SciPy."""
     _, Phi = lowest_modes(problem.system, 10)
     plant, shapes = galerkin(problem, Phi)
@@ -71,7 +72,7 @@ def small(problem: RiccatiProblem) -> tuple[SmallPlant, Shapes, Array]:
     return plant, shapes, -B.T @ P / R
 
 
-def make_controller(small: tuple[SmallPlant, Shapes, Array], q_bar: Array, **keys: Any) -> Controller:
+def make_controller(small: tuple[ReducedSystem, Shapes, Array], q_bar: Array, **keys: Any) -> Controller:
     plant, _, K = small
     x_bar, u_bar = plant.rest_at(q_bar)
     return Controller(K, x_bar, u_bar, plant, **keys)
@@ -80,7 +81,7 @@ def make_controller(small: tuple[SmallPlant, Shapes, Array], q_bar: Array, **key
 AIM = np.array([0.6, -0.3])
 
 
-def test_controller_gives_the_sampled_loop(problem: RiccatiProblem, small: tuple[SmallPlant, Shapes, Array]) -> None:
+def test_controller_gives_the_sampled_loop(problem: RiccatiProblem, small: tuple[ReducedSystem, Shapes, Array]) -> None:
     """Controller.command on the full plant's reduced state is what ClosedLoop applies with the lifted gain."""
     _, shapes, K = small
     controller = make_controller(small, AIM, period=0.02, limits=np.array([3.0, 45.0]))
@@ -98,7 +99,7 @@ def test_controller_gives_the_sampled_loop(problem: RiccatiProblem, small: tuple
 
 
 def test_controller_carries_the_tissue_without_an_observer(
-    problem: RiccatiProblem, small: tuple[SmallPlant, Shapes, Array]
+    problem: RiccatiProblem, small: tuple[ReducedSystem, Shapes, Array]
 ) -> None:
     """Fed with the hand of a full-order run only, its tissue is that of the run, seen through the filter."""
     plant, shapes, K = small
@@ -126,7 +127,7 @@ def test_controller_carries_the_tissue_without_an_observer(
 
 @pytest.mark.serial
 def test_controller_with_own_model_reaches_the_target_at_1_khz(
-    problem: RiccatiProblem, small: tuple[SmallPlant, Shapes, Array]
+    problem: RiccatiProblem, small: tuple[ReducedSystem, Shapes, Array]
 ) -> None:
     """Controller and reduced plant, each stepping by itself, as a robot would."""
     plant, _, K = small
@@ -142,15 +143,14 @@ def test_controller_with_own_model_reaches_the_target_at_1_khz(
     each = (time.perf_counter() - begin) / steps
     assert close(plant.C @ x, plant.C @ controller.x_bar) < 1e-3  # decays like exp(-0.44 t), t = 20
     assert each < 1e-3  # one tick; measured about 1e-5
-    reference = ReducedLoop(plant, period).run(
-        K, plant.rest_at(AIM), steps, (problem.Q, problem.R), Actuation(rate=1000.0)
-    )
+    law = Actuation(rate=1000.0)
+    reference = run_small(plant, period, K, plant.rest_at(AIM), steps, (problem.Q, problem.R), law)
     assert close(plant.C @ x, reference.outputs[-1]) < 1e-9  # the same recursion
     assert close(u, reference.inputs[-1]) < 1e-9  # the same recursion
 
 
 def test_a_controller_survives_its_file_bitwise(
-    model: Model, problem: RiccatiProblem, small: tuple[SmallPlant, Shapes, Array], tmp_path: Path
+    model: Model, problem: RiccatiProblem, small: tuple[ReducedSystem, Shapes, Array], tmp_path: Path
 ) -> None:
     keys: dict[str, Any] = {
         "limits": np.array([5.0, np.inf]),
@@ -180,7 +180,7 @@ def test_a_controller_survives_its_file_bitwise(
         Controller.load(path)
 
 
-def test_towards_moves_the_target_only(small: tuple[SmallPlant, Shapes, Array]) -> None:
+def test_towards_moves_the_target_only(small: tuple[ReducedSystem, Shapes, Array]) -> None:
     controller = make_controller(small, AIM)
     other = controller.towards(2 * AIM)
     assert (other.K == controller.K).all()
@@ -190,7 +190,7 @@ def test_towards_moves_the_target_only(small: tuple[SmallPlant, Shapes, Array]) 
 
 @pytest.mark.ranks
 def test_a_full_gain_survives_its_file(
-    model: Model, problem: RiccatiProblem, small: tuple[SmallPlant, Shapes, Array], tmp_path_factory: Any
+    model: Model, problem: RiccatiProblem, small: tuple[ReducedSystem, Shapes, Array], tmp_path_factory: Any
 ) -> None:
     comm, layout = problem.layout.comm, problem.layout
     folder = comm.bcast(tmp_path_factory.mktemp("gain") if comm.rank == 0 else None)
@@ -225,25 +225,27 @@ def test_hash_knows_the_mesh_only(problem: RiccatiProblem) -> None:
     assert layout_hash(wide.system.layout) != ours
 
 
-def test_what_does_not_fit_is_refused(small: tuple[SmallPlant, Shapes, Array]) -> None:
+def test_what_does_not_fit_is_refused(small: tuple[ReducedSystem, Shapes, Array]) -> None:
     plant, _, K = small
     x_bar, u_bar = plant.rest_at(AIM)
     with pytest.raises(ControlError, match="K of the controller"):
         Controller(K[:, 1:], x_bar, u_bar, plant)
     with pytest.raises(ControlError, match="period"):
         Controller(K, x_bar, u_bar, plant, period=0.0)
-    with pytest.raises(ReductionError, match="shape"):
-        plant.lti().under(K[:1])
-    with pytest.raises(ReductionError, match="finite"):
-        plant.lti().under(np.nan * K)
+    with pytest.raises(ReducedSystemError, match="shape"):
+        plant.under(K[:1])
+    with pytest.raises(ReducedSystemError, match="finite"):
+        plant.under(np.nan * K)
 
 
 # --- other packages
 
 
-def test_python_control_sees_the_same_plant(problem: RiccatiProblem, small: tuple[SmallPlant, Shapes, Array]) -> None:
+def test_python_control_sees_the_same_plant(
+    problem: RiccatiProblem, small: tuple[ReducedSystem, Shapes, Array]
+) -> None:
     plant, _, K = small
-    ours, closed = plant.lti().to_control(), plant.lti().under(K).to_control()
+    ours, closed = plant.to_control(), plant.under(K).to_control()
     assert ours.output_labels == ["tip_x [m]", "tip_y [m]"]
     assert ours.input_labels == ["force_x [N]", "force_y [N]"]
     assert ours.state_labels[:4] == ["q_x [m]", "q_y [m]", "v_x [m/s]", "v_y [m/s]"]
@@ -257,35 +259,35 @@ def test_python_control_sees_the_same_plant(problem: RiccatiProblem, small: tupl
     weight = Q * plant.C.T @ plant.C
     G, _, _ = control.lqr(ours, (weight + weight.T) / 2, R * np.eye(2), method="scipy")
     assert close(-np.asarray(G), K) < 1e-6  # SciPy's equation solver, twice, on matrices of condition 1e4
-    # a step of the target as an initial condition: their simulation against ReducedLoop
+    # a step of the target as an initial condition: their simulation against ours
     x_bar, _ = plant.rest_at(AIM)
     start = plant.rest_at(np.zeros(2))[0]
     times = np.linspace(0.0, 2.0, 21)
     theirs_y = control.initial_response(closed, times, start - x_bar).outputs
-    ours_y = ReducedLoop(plant, 0.001).run(K, plant.rest_at(AIM), 2000, (problem.Q, problem.R)).outputs[::100]
+    ours_y = run_small(plant, 0.001, K, plant.rest_at(AIM), 2000, (problem.Q, problem.R)).outputs[::100]
     assert (
         close(ours_y - plant.C @ x_bar, theirs_y.T) < 1e-4
     )  # midpoint rule, (omega dt)^2 / 12 of the modes that matter
 
 
-def test_pymor_sees_the_same_plant(small: tuple[SmallPlant, Shapes, Array]) -> None:
+def test_pymor_sees_the_same_plant(small: tuple[ReducedSystem, Shapes, Array]) -> None:
     plant, _, K = small
     if MPI.COMM_WORLD.size > 1:
-        with pytest.raises(ReductionError, match="load it there"):
-            plant.lti().to_pymor()
+        with pytest.raises(ReducedSystemError, match="load it there"):
+            plant.to_pymor()
         return
-    theirs, their_loop = plant.lti().to_pymor(), plant.lti().under(K).to_pymor()
+    theirs, their_loop = plant.to_pymor(), plant.under(K).to_pymor()
     assert theirs.order == plant.N
     for s in (0.3 + 1.0j, 5.0j, 40.0j):
         ours = plant.C @ np.linalg.solve(s * plant.E - plant.A, plant.B)
         assert close(theirs.transfer_function.eval_tf(s), ours) < 1e-9  # one solve each
-        assert close(plant.lti().at([s])[0], ours) < 1e-9  # the same
+        assert close(plant.transfer([s])[0], ours) < 1e-9  # the same
         closed = plant.C @ np.linalg.solve(s * plant.E - plant.A - plant.B @ K, plant.B)
         assert close(their_loop.transfer_function.eval_tf(s), closed) < 1e-9  # one solve, as above
     assert their_loop.poles().real.max() < 0
 
 
-def test_start_state_round_trip(problem: RiccatiProblem, small: tuple[SmallPlant, Shapes, Array]) -> None:
+def test_start_state_round_trip(problem: RiccatiProblem, small: tuple[ReducedSystem, Shapes, Array]) -> None:
     """reduce(expand(x)) = x, and expand keeps what the shapes can hold."""
     _, shapes, _ = small
     x = np.random.default_rng(5).standard_normal(small[0].N)

@@ -14,12 +14,13 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.loop.cost import predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions
-from softgrasp.lqr.loop.small import ReducedLoop, galerkin, m_orthonormal
+from softgrasp.lqr.loop.small import galerkin, m_orthonormal
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.target import hand_target, output_target, rest
 from tests.helpers.loop import CASES, Setup, aim, enumerate_input, plain_loop, setup
 from tests.helpers.models import close, gather_rows, gather_states, local_rows, same_everywhere
+from tests.helpers.small_loop import run_small
 
 Array = np.ndarray
 STEPS, END = 40, 4.0
@@ -262,7 +263,7 @@ def test_all_shapes_give_the_full_loop(case: Setup) -> None:
     limit = tuple(1.3 * np.abs(target.u) + 2.0)
     for law in (Actuation(), Actuation(limits=limit), Actuation(rate=10.0, delay=True, limits=limit)):
         run = loop.run(case.gain, target, STEPS, law)
-        small = ReducedLoop(plant, dt).run(K, (x_bar, u_bar), STEPS, (problem.Q, problem.R), law)
+        small = run_small(plant, dt, K, (x_bar, u_bar), STEPS, (problem.Q, problem.R), law)
         assert close(small.outputs, run.outputs) < 1e-8  # two ways to the same numbers, condition of M and K
         assert close(small.inputs, run.inputs) < 1e-8  # as above
         assert close(small.cost, run.cost) < 1e-8  # as above
@@ -281,21 +282,15 @@ def test_few_modes_give_nearly_the_full_loop() -> None:
     loop = ClosedLoop(problem, 0.05)
     run = loop.run(case.gain, target, 200)
     K = shapes.reduce_gain(problem, case.gain)
-    small = ReducedLoop(plant, 0.05).run(K, plant.rest_at(aim(case)), 200, (problem.Q, problem.R))
+    small = run_small(plant, 0.05, K, plant.rest_at(aim(case)), 200, (problem.Q, problem.R))
     error = close(small.outputs, run.outputs)
     assert error < 2e-3  # static share of the modes left out, about (omega_1 / omega_12)^2 of a deformation of 3 %
     assert small.cost[-1] == pytest.approx(run.cost[-1], rel=1e-4)  # sag is little of the cost: 3e-6
     loop.destroy()
 
 
-def test_reduced_loop_refuses_what_does_not_fit() -> None:
+def test_dependent_shapes_are_refused() -> None:
     case = setup("one_way")
     _, V = lowest_modes(case.problem.system, 3)
-    plant, _ = galerkin(case.problem, V)
-    x_u, weights = plant.rest_at(aim(case)), (case.problem.Q, case.problem.R)
-    with pytest.raises(ControlError, match="shape"):
-        ReducedLoop(plant, 0.1).run(np.zeros((2, 3)), x_u, 5, weights)
-    with pytest.raises(SolverError, match="diverged"):
-        ReducedLoop(plant, 0.1).run(np.hstack([100 * np.eye(2), np.zeros((2, 8))]), x_u, 5000, weights)
     with pytest.raises(ControlError, match="linearly dependent"):
         galerkin(case.problem, np.asfortranarray(np.hstack([V, V])))

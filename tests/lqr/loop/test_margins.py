@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from softgrasp.fem.reduced import ReducedSystem
 from softgrasp.lqr.loop.controller import Controller
 from softgrasp.lqr.loop.margins import loop_margins, sampled
-from softgrasp.lqr.loop.small import SmallPlant
 
 Array = np.ndarray
 M, C_D, K_T = 2.0, 0.05, 30.0  # hand mass, damping and stiffness of a tissue of one shape
 
 
-def plant(n_s: int = 2) -> SmallPlant:
+def plant(n_s: int = 2) -> ReducedSystem:
     """A hand with a tissue of two masses on springs; axis 2 is stiffer."""
     k = n_s
     E, A = np.eye(2 * n_s + 2 * k), np.zeros((2 * n_s + 2 * k,) * 2)
@@ -27,10 +27,10 @@ def plant(n_s: int = 2) -> SmallPlant:
     B[v] = np.eye(n_s) / M
     C = np.hstack([np.eye(n_s), np.zeros((n_s, n_s)), np.eye(k), np.zeros((k, k))])
     one = np.eye(2 * n_s, len(E))
-    return SmallPlant(E, A, B, C, np.zeros(len(E)), one[:n_s], one[n_s:], ("tip_x", "tip_y")[:n_s])
+    return ReducedSystem(E, A, B, C, np.zeros(len(E)), one[:n_s], one[n_s:], ("tip_x", "tip_y")[:n_s])
 
 
-def controller(p: SmallPlant, period: float) -> Controller:
+def controller(p: ReducedSystem, period: float) -> Controller:
     A, B = np.linalg.solve(p.E, p.A), np.linalg.solve(p.E, p.B)
     P = scipy.linalg.solve_continuous_are(A, B, 50 * p.C.T @ p.C + 1e-3 * np.eye(p.N), np.eye(len(B.T)))
     return Controller(-B.T @ P, np.zeros(p.N), np.zeros(len(B.T)), p, period)
@@ -38,7 +38,7 @@ def controller(p: SmallPlant, period: float) -> Controller:
 
 def radius(c: Controller, scale: Array, delay: int) -> float:
     """Spectral radius of the loop with the gains of the inputs scaled, and the load some ticks late."""
-    A, B = sampled(c.plant.lti(), c.period)
+    A, B = sampled(c.plant, c.period)
     n_s, N = c.n_s, c.plant.N
     whole = np.zeros((N + delay * n_s,) * 2)
     whole[:N, :N] = A
@@ -91,7 +91,7 @@ def test_continuous_limit_is_the_guarantee_of_lqr() -> None:
 def test_python_control_finds_the_same() -> None:
     c = controller(plant(1), 0.1)
     (axis,) = loop_margins(c, delay=1).axes
-    A, B = sampled(c.plant.lti(), c.period)
+    A, B = sampled(c.plant, c.period)
     loop = control.ss(A, B, -c.K, 0, c.period, remove_useless_states=False) * control.tf([1], [1, 0], c.period)
     gains, phases, _, _, at, _ = control.stability_margins(loop, returnall=True)
     assert axis.gain_up == pytest.approx(min(gain for gain in gains if gain > 1), rel=1e-3)  # interpolated, see above

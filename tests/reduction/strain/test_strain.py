@@ -19,12 +19,12 @@ from softgrasp.fem.strain.compiled import library
 from softgrasp.fem.strain.laws import LAWS, LawName
 from softgrasp.reduction.archive import load, save, write_checksums
 from softgrasp.reduction.bases.basis import ReductionError
-from softgrasp.reduction.model import ModelError, Outputs
 from softgrasp.reduction.strain import stepper
 from softgrasp.reduction.strain.cells import Cells, Potential
 from softgrasp.reduction.strain.model import StrainModel, TrainingDomain
 from softgrasp.reduction.strain.nnls import nnls
 from softgrasp.reduction.strain.stepper import March, StrainProblem, march_strain
+from softgrasp.reduction.system import ModelError, Outputs
 
 pytestmark = pytest.mark.serial
 LAYERS = (LayerMaterial(50.0, 50.0, 1.0), LayerMaterial(80.0, 20.0, 1.0))

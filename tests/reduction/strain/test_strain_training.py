@@ -19,12 +19,12 @@ from softgrasp.fem.strain.body import HyperelasticBody
 from softgrasp.reduction.archive import load, save
 from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.bases.states import BasisError
-from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import moved_to, run_at
 from softgrasp.reduction.reduce import errors, reduce, reduce_linear, replay
 from softgrasp.reduction.replay import FullRun, full_run
 from softgrasp.reduction.strain.cells import Potential
 from softgrasp.reduction.strain.training import Training, errors_strain, replay_strain, train
+from softgrasp.reduction.system import ModelError
 
 SMALL = ("tissue.cells=[6, 12]", "time.steps=120", "effects.finite_strain={}")
 

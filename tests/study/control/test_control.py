@@ -222,7 +222,7 @@ def test_files_can_be_used(result: dict[str, Any], out: Path) -> None:
     assert controller.plant.N == result["controller"]["N"] == 12
     u = controller.step(np.zeros(2), np.zeros(2))
     assert np.linalg.norm(u) == pytest.approx(np.hypot(5, 3), rel=1e-4)  # |K_T d| = |d|, at the error of this gain
-    exported = controller.plant.lti()
+    exported = controller.plant
     labels = [name.split()[0] for name in exported.to_control().output_labels]
     assert labels == result["loop"]["output_names"] == [n.split()[0] for n in table[0][3:5]]
     small = controller.plant
@@ -406,7 +406,7 @@ def test_outputs_that_see_only_the_hand(tmp_path: Path, method: str) -> None:
     assert controller.plant.N == 4
     u = controller.step(np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     assert np.allclose(u, [4.0, 3.0 - np.sqrt(40)], rtol=0, atol=1e-9)  # as above
-    labels = controller.plant.lti().to_control().output_labels
+    labels = controller.plant.to_control().output_labels
     assert [name.split()[0] for name in labels] == ["arm_x", "arm_y"]
 
 

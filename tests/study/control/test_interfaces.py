@@ -14,9 +14,9 @@ from rich.console import Console
 import softgrasp as sg
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import to_scipy
+from softgrasp.fem.reduced import ReducedSystem
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.lqr.loop.margins import loop_margins
-from softgrasp.reduction.lti import LTI
 from softgrasp.study.control.plots import figure_bode
 from softgrasp.study.control.run import run_control
 from softgrasp.study.reduce.run import run_reduce
@@ -48,13 +48,13 @@ def full_response(name: str, s: float) -> np.ndarray:
     return np.asarray(tip.C_s @ q + tip.weight * z[tip.dofs].sum(axis=0))
 
 
-def check(system: LTI, name: str, tolerance: float) -> None:
+def check(system: ReducedSystem, name: str, tolerance: float) -> None:
     """The same numbers from the file, python-control, pyMOR and the full model."""
     assert system.inputs == ("force_x [N]", "force_y [N]")
     assert all(output.endswith(" [m]") for output in system.outputs)
     theirs, pymors = system.to_control(), system.to_pymor()
     for s in (0.5, 2.0, 6.0):
-        ours = system.at([s])[0]
+        ours = system.transfer([s])[0]
         np.testing.assert_allclose(theirs(s), ours, rtol=1e-8)  # one solve more, of a small well conditioned E
         np.testing.assert_allclose(pymors.transfer_function.eval_tf(s), ours, rtol=1e-8)
         whole = full_response(name, s)
@@ -63,9 +63,9 @@ def check(system: LTI, name: str, tolerance: float) -> None:
 
 def test_reduced_model_from_its_file(files: Path) -> None:
     rom = sg.load(files / "reduce" / "models" / "craig_bampton.h5")
-    check(rom.lti(), "paper_forward", 5e-3)  # N = 24; 2e-3 at s = 6, above the lowest frequency
-    stiff = rom.lti(tuple(m.__class__(m.lam, 2 * m.mu, m.rho, m.beta) for m in rom.materials))
-    assert not np.allclose(stiff.at([2.0]), rom.lti().at([2.0]), rtol=1e-3)
+    check(rom.at(), "paper_forward", 5e-3)  # N = 24; 2e-3 at s = 6, above the lowest frequency
+    stiff = rom.at(tuple(m.__class__(m.lam, 2 * m.mu, m.rho, m.beta) for m in rom.materials))
+    assert not np.allclose(stiff.transfer([2.0]), rom.at().transfer([2.0]), rtol=1e-3)
     with (files / "reduce" / "points.csv").open() as file:
         assert "time_online [s]" in next(csv.reader(file))
 
@@ -74,8 +74,8 @@ def test_controller_from_its_file(files: Path) -> None:
     controller = sg.Controller.load(files / "control" / "controller.npz")
     assert controller.limits is not None
     assert controller.limits.tolist() == [9.0, 7.0]
-    check(controller.plant.lti(), "paper_lqr", 0.05)  # a few modes
-    closed = controller.plant.lti().under(controller.K).to_control()
+    check(controller.plant, "paper_lqr", 0.05)  # a few modes
+    closed = controller.plant.under(controller.K).to_control()
     assert closed.poles().real.max() < 0
     told = json.loads((files / "control" / "result.json").read_text())["controller"]["margins"]
     margins = loop_margins(controller)
