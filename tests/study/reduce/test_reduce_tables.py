@@ -16,8 +16,8 @@ PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"
 
 
 def test_scene_chooses_methods() -> None:
-    assert chosen_methods(make_scene().reduction) == (*PAPER_METHODS, *FURTHER)
-    assert chosen_methods(make_scene(reduction={"methods": ["psd_qv"]}).reduction) == ("psd_qv",)
+    assert chosen_methods(make_scene()) == (*PAPER_METHODS, *FURTHER)
+    assert chosen_methods(make_scene(reduction={"methods": ["psd_qv"]})) == ("psd_qv",)
 
 
 def point(N: int, error: float, stable: bool = True, online: float = 1e-3) -> Point:
