@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.layout import Patches
+from softgrasp.fem.petsc import to_ranks
 
 
 def make_patches(V: Any, free: NDArray[Any]) -> Patches:
@@ -61,13 +62,8 @@ def _whole(index: Any, vertex: NDArray[Any], node: NDArray[Any]) -> tuple[NDArra
     """
     owned, comm = index.size_local, index.comm
     away = vertex >= owned
-    order = np.argsort(owner := index.owners[vertex[away] - owned], kind="stable")
-    there = index.local_to_global(vertex[away].astype(np.int32))
-    sent = np.ascontiguousarray(np.column_stack([there, node[away]])[order].astype(np.int64))
-    counts, coming = 2 * np.bincount(owner, minlength=comm.size), np.empty(comm.size, dtype=np.int64)
-    comm.Alltoall(counts, coming)
-    found = np.empty((int(coming.sum()) // 2, 2), dtype=np.int64)
-    comm.Alltoallv([sent, counts], [found, coming])
+    there = index.local_to_global(vertex[away].astype(np.int32)).astype(np.int64)
+    found = to_ranks(comm, index.owners[vertex[away] - owned], np.column_stack([there, node[away]]))
     found[:, 0] -= index.local_range[0]
     pairs = np.unique(np.concatenate([found, np.column_stack([vertex[~away], node[~away]])]), axis=0)
     return pairs[:, 0], pairs[:, 1]

@@ -18,7 +18,7 @@ from softgrasp.fem.run.simulate import frame_count
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.costs import BUILD, ENTRIES, ITERATIVE, SolverName, seams
 
-TYPICAL, WORST = 1.4, 3.0  # factors of `python -m benchmarks scale`, the geometric mean and the largest, of whole runs
+TYPICAL, WORST = 1.3, 2.6  # factors of `python -m benchmarks scale`, the geometric mean and the largest, of whole runs
 START = 3.0  # time of every command: imports, page and pictures of a small run [s]
 LIBRARIES = 160.0 * 2**20  # memory of the libraries on each rank [byte]
 PRODUCTS = 2  # products of a step beside its solve, those of its vectors included [1]

@@ -70,8 +70,8 @@ COSTS: dict[tuple[SolverName, int, bool], Cost] = {
     ("mumps", 3, False): Cost((13.1, 2.0), (0.158, 1.5), (10_600, 1 / 3), 3e5, fixed=0.033, messages=100),
     ("mumps", 3, True): Cost((12.8, 2.0), (0.144, 4 / 3), (10_600, 1 / 3), 3e5, fixed=0.033, messages=100),
     ("cg", 3, False): Cost((0.8, 1.0), (0.022, 1.0), (900, 0.0), np.inf, iterations=(9, 9.6), messages=22),
-    ("cg", 3, True): Cost((2.0, 1.0), (0.080, 1.0), (1000, 0.0), np.inf, iterations=(16, 16), messages=22),
-    ("stars", 3, True): Cost((2.8, 1.17), (0.044, 1.2), (4000, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
+    ("cg", 3, True): Cost((2.0, 1.0), (0.080, 1.0), (700, 0.0), np.inf, iterations=(16, 16), messages=22),
+    ("stars", 3, True): Cost((2.8, 1.17), (0.044, 1.2), (3200, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
 }
 
 

@@ -141,7 +141,7 @@ def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
     if report.estimate is not None and report.bound is not None and report.time_error is not None:
         lines.append(
             f"The error of the deformation is about {percent(report.estimate)} "
-            f"{'or less, as estimated on coarser cells' if report.coarser else 'on this mesh'} "
+            f"{'as extrapolated from coarser cells' if report.coarser else 'on this mesh'} "
             f"(bound {percent(report.bound)}), and {percent(report.time_error)} by the time step."
         )
     else:

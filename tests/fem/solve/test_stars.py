@@ -73,9 +73,10 @@ def test_blocks_are_inverses_over_the_stars(name: str) -> None:
             expected[at] += np.linalg.inv(dense[at])
     assert layout.patches is not None
     patches = layout.patches()
-    i, j, values = star_inverses(S, patches, d)
     found = np.zeros_like(dense)
-    np.add.at(found, (i.ravel(), j.ravel()), values.ravel())
+    for nodes, inverses in star_inverses(S, patches, d):
+        dofs = (d * nodes[:, :, None] + np.arange(d)).reshape(len(nodes), -1)
+        np.add.at(found, (dofs[:, :, None], dofs[:, None, :]), inverses)
     assert close(found, expected) < 1e-12  # condition of a star below 1e3
     P = np.zeros((len(free), patches.count))
     P[patches.row, patches.column] = patches.weight
