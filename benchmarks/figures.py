@@ -8,7 +8,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -163,10 +163,10 @@ def short(value: float) -> str:
     return f"{value:#.3g}".rstrip(".")
 
 
-def table_of(found: Row, commands: Sequence[Command] = COMMANDS) -> Table:
+def table_of(found: Row) -> Table:
     """One line a figure: what it says, median, least and most of each of its numbers, command."""
     lines: list[list[str]] = []
-    for command in commands:
+    for command in COMMANDS:
         if command.name not in found:
             continue
         columns, place = found[command.name]["values"], 0
