@@ -48,7 +48,7 @@ class MeshEstimate:
     n_e: int  # tissue unknowns of the mesh that was estimated [1]
     finer: int  # tissue unknowns of the mesh that it was compared with [1]
     # finer mesh: "order", the next order on the same cells, or "graded", another mesh, which meets the zone; "coarser":
-    # the error is that of a mesh of fewer cells, about as large or larger
+    # the error is extrapolated from a mesh of fewer cells
     by: str
     tolerance: float | None = None  # tolerance of the scene [1], or None
     passes: int = 0  # number of refinements after the first estimate [1]

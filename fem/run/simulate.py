@@ -261,6 +261,7 @@ class Run(Stepped):
             final=self.state.array.copy(),
             energy_drift=self.drift(),
             residuals=(self.residual_first, self.residual_last),
+            solve_error=self.midpoint.solve_error(),
             solver=self.solver,
             seconds=seconds,
             steps_timed=self.counted,

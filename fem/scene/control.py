@@ -26,6 +26,11 @@ class Reduction(Section):
     methods: list[str] = Field(
         default_factory=list, description="bases by name [no unit]; empty: the paper's six and the best beyond them"
     )
+    plugins: list[Label] = Field(
+        default_factory=list,
+        description="Python files with bases of your own, whose names `methods` may then take [no unit]; they join the "
+        "comparison, and they run with your rights",
+    )
     N: list[Annotated[int, Field(ge=1)]] = Field(
         default_factory=lambda: [4, 6, 8, 10, 12, 14, 18, 22, 26, 30, 40, 60],
         description="numbers of basis vectors to try, the hand's own included [1]",

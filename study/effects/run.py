@@ -13,8 +13,8 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
+from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.errors import ResourceError, SolverError
-from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import free_bytes, size_text
 from softgrasp.fem.model.scales import rigid_inertia
 from softgrasp.fem.scene.scene import Scene
@@ -46,7 +46,8 @@ def study_effects(
         ResourceError: the factors of all variants would not fit in memory at once.
     """
     scene = bare_output(scene)
-    model = build(scene, comm=comm)  # also compiles the forms
+    model = adapt.build(scene, comm=comm)  # also compiles the forms
+    mesh = adapt.adapted_mesh(model)
     explanation = explain_model(model)
     omega = explanation.time.omega
     first = float(omega[0]) if len(omega) else None
@@ -61,9 +62,10 @@ def study_effects(
         if progress is not None:
             progress(next(steps), (2 * repeats + 1) * len(scenes))
 
-    cases = measure_builds(comm, scenes, repeats, tick)
+    cases = measure_builds(comm, scenes, repeats, tick, mesh)
     on = frozenset(s.name for s in effects if s.on)
-    runs = Experiments(scene, scales, {on: cases[SCENE].model} | {on ^ {s.name}: cases[s.name].model for s in tried})
+    models = {on: cases[SCENE].model} | {on ^ {s.name}: cases[s.name].model for s in tried}
+    runs = Experiments(scene, scales, models, mesh)
     changes: Changes = {}
     for s in tried:
         try:
@@ -80,10 +82,10 @@ def study_effects(
         s.name for s in tried if s.name in changes and shows(s, changes[s.name], explanation.effects[s.name], scene)
     )
     together = advised(runs, needed, changes)
-    elements = check_elements(runs.models[on], runs.first, scene.study.tolerance)
+    elements = check_elements(runs.models[on], runs.first, scene.study.tolerance, mesh)
     measure_steps(comm, cases, repeats, tick)
     for name, case in cases.items():
-        case.objects, case.objects_in_steps = objects_of(comm, scenes[name])
+        case.objects, case.objects_in_steps = objects_of(comm, scenes[name], mesh)
     base, again = cases[SCENE], cases[AGAIN]
     ratio = np.array(again.seconds["step"]) / np.array(base.seconds["step"]) - 1
     noise = max(TIMER, float(np.abs(ratio).max()))
@@ -99,6 +101,7 @@ def study_effects(
         noise=ends(ratio),
         noise_quartiles=ends(ratio, 0.25),
         base={stage: float(np.median(base.seconds[stage])) for stage in ("mesh", "assembly", "setup", "step")}
+        | ({} if mesh is None else {"mesh": model.watch.seconds["mesh"]})
         | {"memory": sum(base.bytes.values()), "flops": base.flops},
         sizes={name: getattr(layout, name) for name in ("n_s", "n_e", "states")}
         | {"steps": scene.time.steps, "cells": explanation.sizes.cells},

@@ -12,6 +12,7 @@ import h5py
 from mpi4py import MPI
 from rich.console import Console
 
+from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.errors import SceneError, raise_on_all_ranks
 from softgrasp.fem.mesh.scene_hash import scene_keys
 from softgrasp.fem.model.build import Model, Stopwatch, build
@@ -175,7 +176,11 @@ def _full_model(
         kind = "motion" if drive.force is None else "force"
         table = {"profile": "csv", "csv": str(motion.absolute()), "drive": kind}
         overrides.append(f"motion={toml_value(table)}")
-    full = build(load_scene_collective(MPI.COMM_WORLD, scene, overrides), comm=MPI.COMM_WORLD)
+    # other steps and motions may need another mesh: the model is of that of its own scene
+    own = load_scene_collective(MPI.COMM_WORLD, scene)
+    tolerant = own.tissue.refine is not None and own.tissue.refine.tolerance is not None
+    mesh = adapt.adapted_mesh(adapt.build(own, comm=MPI.COMM_WORLD, steps=False)) if tolerant else None
+    full = build(load_scene_collective(MPI.COMM_WORLD, scene, overrides), comm=MPI.COMM_WORLD, mesh=mesh)
     load_certified(path, full.system.layout)  # refuses another mesh
     return full
 

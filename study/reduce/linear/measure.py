@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.scene.control import Reduction
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.bases import registry
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.bases.states import BasisError, States, states_of
@@ -49,9 +50,18 @@ Progress = Callable[[int, int], None]
 """Called with what is done and what there is."""
 
 
-def chosen_methods(options: Reduction) -> tuple[str, ...]:
-    """Methods of the scene, or the paper's six and further ones. Raises BasisError: a name is unknown."""
-    names = tuple(options.methods) or (*registry.PAPER_METHODS, *FURTHER)
+def chosen_methods(scene: Scene) -> tuple[str, ...]:
+    """Methods of the scene, or the paper's six, further ones and the scene's own. Collective.
+
+    Raises BasisError: a name is unknown, or a file of ``reduction.plugins`` does not give a basis.
+    """
+    options: Reduction = scene.reduction
+    own: tuple[str, ...] = ()
+    if options.plugins:
+        from softgrasp.reduction.bases.plugins import load_plugins  # only scenes with bases of their own pay for it
+
+        own = load_plugins([scene.path(file) for file in options.plugins])
+    names = tuple(options.methods) or (*registry.PAPER_METHODS, *FURTHER, *own)
     for name in names:
         registry.find_method(name)
     return names

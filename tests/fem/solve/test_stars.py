@@ -73,9 +73,10 @@ def test_blocks_are_inverses_over_the_stars(name: str) -> None:
             expected[at] += np.linalg.inv(dense[at])
     assert layout.patches is not None
     patches = layout.patches()
-    i, j, values = star_inverses(S, patches, d)
     found = np.zeros_like(dense)
-    np.add.at(found, (i.ravel(), j.ravel()), values.ravel())
+    for nodes, inverses in star_inverses(S, patches, d):
+        dofs = (d * nodes[:, :, None] + np.arange(d)).reshape(len(nodes), -1)
+        np.add.at(found, (dofs[:, :, None], dofs[:, None, :]), inverses)
     assert close(found, expected) < 1e-12  # condition of a star below 1e3
     P = np.zeros((len(free), patches.count))
     P[patches.row, patches.column] = patches.weight
@@ -99,6 +100,20 @@ def test_solves_agree_with_a_dense_solve_on_any_ranks(comm: MPI.Intracomm, name:
     # tolerance times the condition, about 1e2
     assert close(gather_rows(system.layout, w.array_r), np.linalg.solve(dense, full)) < 1e-10
     solver.destroy()
+
+
+@pytest.mark.ranks
+def test_stars_are_whole_on_any_ranks(comm: MPI.Intracomm) -> None:
+    """The matrix of their inverses is that of one rank, also where cells at a vertex are no ghosts of its owner."""
+    found = []
+    for ranks in (comm, MPI.COMM_SELF):
+        system = build("block_3d", silicone([3, 3, 4]), ranks).system
+        solver = make_solver(dynamic_stiffness(system, 400.0), "stars", system.layout, "test_")
+        assert solver.stars is not None
+        B = solver.stars.matrices[1].convert("aij", PETSc.Mat())
+        found.append(gather_matrix(system.layout, B).toarray())
+        solver.destroy()
+    assert close(*found) < 1e-10  # condition of a star below 1e4
 
 
 @pytest.mark.ranks

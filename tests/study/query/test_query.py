@@ -16,6 +16,7 @@ from mpi4py import MPI
 from rich.console import Console
 from typer.testing import CliRunner
 
+from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.errors import SceneError, SoftgraspError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.simulate import simulate
@@ -399,3 +400,16 @@ def test_a_page_says_what_came_out_and_how_far_it_is_off(file: Path, tmp_path: P
         assert (tmp_path / "page" / "answer.csv").exists() == (kind != "refused")
     with pytest.raises(SceneError, match="it holds the results of query"):
         claim(tmp_path / "page", "simulate", "certified")
+
+
+def test_the_full_model_is_on_the_mesh_that_a_tolerance_led_to(tmp_path: Path) -> None:
+    """For other steps too, whose own estimate would ask for another mesh."""
+    scene = load_scene(SCENES / "paper_forward.toml", [*KV, "tissue.refine={tolerance=0.05}"])
+    model = adapt.build(scene, comm=MPI.COMM_WORLD)
+    assert model.system.layout.n_e != build(scene, comm=MPI.COMM_WORLD).system.layout.n_e  # what was built before
+    (tmp_path / "scene.toml").write_text(resolved_toml(scene))
+    path = tmp_path / "certified.h5"
+    save_certified(certified_model(model, lowest_modes(model.system, 16)[1], k=8, tolerance=0.5), path)
+    status, text = ask(path, tolerance=1e-9, fallback="full", dt=0.05)
+    assert status == 0
+    assert "full model, 60 steps" in text
