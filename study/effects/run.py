@@ -19,7 +19,16 @@ from softgrasp.fem.model.memory import free_bytes, size_text
 from softgrasp.fem.model.scales import rigid_inertia
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.experiments import Experiments, check_elements
-from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, ends, measure_builds, measure_steps, objects_of
+from softgrasp.study.effects.measure import (
+    AGAIN,
+    SCENE,
+    MeasuredScene,
+    bare_output,
+    ends,
+    measure_builds,
+    measure_steps,
+    objects_of,
+)
 from softgrasp.study.effects.page import compose
 from softgrasp.study.effects.result import EffectsStudy
 from softgrasp.study.effects.switch import Scales, switches
@@ -100,13 +109,19 @@ def study_effects(
         builds=len(base.seconds["setup"]),
         noise=ends(ratio),
         noise_quartiles=ends(ratio, 0.25),
-        base={stage: float(np.median(base.seconds[stage])) for stage in ("mesh", "assembly", "setup", "step")}
-        | ({} if mesh is None else {"mesh": model.watch.seconds["mesh"]})
-        | {"memory": sum(base.bytes.values()), "flops": base.flops},
+        base=_cost_of(base, None if mesh is None else model.watch.seconds["mesh"]),
         sizes={name: getattr(layout, name) for name in ("n_s", "n_e", "states")}
         | {"steps": scene.time.steps, "cells": explanation.sizes.cells},
         elements=elements,
     )
+
+
+def _cost_of(case: MeasuredScene, mesh: float | None) -> dict[str, float]:
+    """Times [s], memory [byte] and operations of a scene; ``mesh``: time of a mesh that all share, None of its own."""
+    times = {stage: float(np.median(case.seconds[stage])) for stage in ("mesh", "assembly", "setup", "step")}
+    if mesh is not None:
+        times["mesh"] = mesh
+    return times | {"memory": sum(case.bytes.values()), "flops": case.flops}
 
 
 def check_variants(scene: Scene, comm: MPI.Intracomm, explanation: Explanation, variants: int) -> None:
