@@ -264,7 +264,8 @@ class Scene(Shown, Section):
         for name, layer in self.tissue.layers.items():
             if layer.beta is not None and effects.damping is None:
                 raise ValueError(f"tissue.layers.{name}.beta needs effects.damping; give it or drop beta")
-        check_obstacles(self.obstacle, used=False)
+        planned = self.control is not None and self.control.constraints is not None
+        check_obstacles(self.obstacle, used=planned)
         if self.dimension is not None:
             _check_vectors(self, self.dimension)
         return self

@@ -49,7 +49,7 @@ def nearest(G: Array, h: Array, start: Sequence[int] = (), limit: int = 10_000) 
     size = np.linalg.norm(G, axis=1)
     empty = size == 0
     if (h[empty] < 0).any():
-        raise InfeasibleError("a row of the plan without inputs is violated")
+        raise InfeasibleError("a row without entries is violated")
     size[empty] = 1.0
     G, h = G / size[:, None], np.where(empty, 0.0, h / size)
     x, active, multipliers = _restart(G, h, [i for i in start if not empty[i]])
@@ -105,7 +105,7 @@ def _enter(G: Array, active: list[int], multipliers: Array, row: int, violation:
         first = int(np.argmin(ratios)) if len(falls) else -1
         length = min(full, float(ratios[first]) if first >= 0 else np.inf)
         if np.isinf(length):
-            raise InfeasibleError("no plan keeps all limits and gaps")
+            raise InfeasibleError("no point keeps all rows")
         multipliers, own = multipliers - length * inside, own + length
         violation -= length * square
         if length == full:

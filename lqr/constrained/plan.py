@@ -6,7 +6,6 @@ fall from round to round and every round is safe. Both sides of an obstacle on t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -44,6 +43,7 @@ class Task:
     error: Array  # bound on what the reduced plant leaves out at every node [m], (nodes, 2)
     clearance: float = 0.0  # distance to keep beyond that [m]
     limits: Limits = field(default_factory=Limits)  # of the hand
+    penalty: float | None = None  # cost of a metre inside an obstacle [1/m]; None: :data:`PRICE` times that of the way
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Plan:
     slack: Array  # depth inside clearance and margin, by obstacle and interval [m], (obstacles, H)
     bend: float  # largest bound on what a node that holds the plan does between two instants [m]
     multiplier: float  # largest cost of a metre of one row [1/m]
-    active: int  # rows that hold the plan
+    active: tuple[int, ...]  # rows that hold the plan, empty where gaps are not kept
     costs: tuple[float, ...]  # |c|^2 of the rounds
     steps: int  # changes of the active set in all rounds
     sides: tuple[int, ...]  # on which the obstacles on the way are passed, 1: left of it
@@ -118,23 +118,23 @@ def places(horizon: Horizon, task: Task, c: Array) -> Array:
     return np.asarray(task.places + np.einsum("jdn,kin->kijd", horizon.plant.Y, horizon.state(task.start, c)))
 
 
-def make_plan(plant: HeldPlant, task: Task, steps: int, notify: Callable[[int], None] | None = None) -> Plan:
+def make_plan(plant: HeldPlant, task: Task, steps: int, longest: int | None = None) -> Plan:
     """The cheapest plan of all ways that are tried, on a horizon that is made longer until the tail is safe.
 
     Args:
         plant: reduced plant on the grid.
         task: start, obstacles and limits.
         steps: intervals of the first horizon.
-        notify: called with the number of ways done.
+        longest: intervals of the last one; None for :data:`LONGEST` times the first.
 
     Raises ControlError: the target keeps no gap or limit, or the limits of the hand cannot be kept.
     """
     level = tail_level(plant, _at_target(task), task.limits, task.u_bar)
     if not level > 0:
         raise ControlError("the target holds the hand beyond its own limit of force; raise control.constraints.force")
-    longest = LONGEST * steps
+    longest = LONGEST * steps if longest is None else longest
     while True:
-        plan = _cheapest(Horizon(plant, steps), task, level, notify)
+        plan = _cheapest(Horizon(plant, steps), task, level)
         if not plan.unsafe or steps >= longest:
             return plan
         steps = min(longest, steps + plan.unsafe)
@@ -162,7 +162,7 @@ def _free(shape: Shape, task: Task, normals: Array) -> Array:
     return np.asarray(off - task.clearance - np.abs(normals) @ task.error.T)
 
 
-def _cheapest(horizon: Horizon, task: Task, level: float, notify: Callable[[int], None] | None) -> Plan:
+def _cheapest(horizon: Horizon, task: Task, level: float) -> Plan:
     """All sides of the obstacles on the way."""
     free = places(horizon, task, np.zeros(horizon.plant.n_s * horizon.steps))
     first = [_normals(shape, free) for shape in task.shapes]
@@ -171,13 +171,11 @@ def _cheapest(horizon: Horizon, task: Task, level: float, notify: Callable[[int]
     way, still = free[:, 0].mean(axis=1), task.places - task.places.mean(axis=0)
     ways = list(product((1, -1), repeat=len(on_way)))
     plans: list[Plan] = []
-    for done, sides in enumerate(ways[:MOST_WAYS], 1):
+    for sides in ways[:MOST_WAYS]:
         normals = list(first)
         for i, side in zip(on_way, sides, strict=True):
             normals[i] = past(task.shapes[i], way, still, side)
         plans.append(_rounds(horizon, task, np.array(normals).reshape(-1, horizon.steps, 2), level, sides))
-        if notify is not None:
-            notify(done)
     best = min(plans, key=lambda p: (p.depth > 0, p.depth if p.depth > 0 else float(p.c @ p.c)))
     tried = tuple((p.sides, float(p.c @ p.c), p.depth) for p in plans)
     return replace(best, tried=tried, untried=len(ways) - len(plans))
@@ -195,21 +193,18 @@ def _normals(shape: Shape, body: Array) -> Array:
 
 def _rounds(horizon: Horizon, task: Task, normals: Array, level: float, sides: tuple[int, ...]) -> Plan:
     """Half-planes, plan, half-planes from the plan, until nothing changes."""
-    plant = horizon.plant
-    c, best = np.zeros(plant.n_s * horizon.steps), None
+    c, best = np.zeros(horizon.plant.n_s * horizon.steps), None
     active: tuple[int, ...] = ()
     hard = limit_rows(horizon, task.start, task.limits, task.u_bar)
     costs: list[float] = []
     steps = 0
     for _ in range(ROUNDS):
-        x, u = horizon.state(task.start, c), horizon.input(task.start, c)
-        margins = [ROOM * both_ends(bends(plant, x, u, n)) for n in normals]
-        G, h, group = _rows(horizon, task, normals, margins)
+        G, h, group = _rows(horizon, task, normals, c)
         c, slack, multipliers, active, more = _solve(G, h, group, hard, active, _price(horizon, task))
         steps, slack = steps + more, slack.reshape(len(normals), -1)
         costs.append(float(c @ c))
         plan = _judged(horizon, task, c, normals, slack, multipliers, level)
-        plan = replace(plan, costs=tuple(costs), steps=steps, sides=sides)
+        plan = replace(plan, active=active, sides=sides)
         if best is None or _better(plan, best):
             best = plan
         if len(costs) > 1 and abs(costs[-1] - costs[-2]) <= SETTLED * costs[-1] and (plan.gap >= 0 or plan.depth > 0):
@@ -218,6 +213,14 @@ def _rounds(horizon: Horizon, task: Task, normals: Array, level: float, sides: t
         normals = np.array([_normals(s, body) for s in task.shapes]).reshape(-1, horizon.steps, 2)
     assert best is not None
     return replace(best, costs=tuple(costs), steps=steps)
+
+
+def quadratic_program(plan: Plan) -> tuple[Array, Array]:
+    """G c <= h of all gaps and limits with the half-planes and the bends of a plan: one more round."""
+    G, h, _ = _rows(plan.horizon, plan.task, plan.normals, plan.c)
+    task = plan.task
+    hard = limit_rows(plan.horizon, task.start, task.limits, task.u_bar)
+    return np.vstack([G, hard[0]]), np.concatenate([h, hard[1]])
 
 
 def _better(plan: Plan, other: Plan) -> bool:
@@ -229,16 +232,18 @@ def _better(plan: Plan, other: Plan) -> bool:
 
 def _price(horizon: Horizon, task: Task) -> float:
     """Of a metre inside an obstacle [1/m]."""
+    if task.penalty is not None:
+        return task.penalty
     way = float(np.linalg.norm(task.start[: horizon.plant.n_s]))
     return PRICE * float(task.start @ horizon.plant.P @ task.start) / way
 
 
-def _rows(
-    horizon: Horizon, task: Task, normals: Array, margins: Sequence[Array]
-) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Rows of all obstacles, and the group of each: its obstacle and interval."""
-    rows, right = [np.zeros((0, horizon.plant.n_s * horizon.steps))], [np.zeros(0)]
-    for shape, n, margin in zip(task.shapes, normals, margins, strict=True):
+def _rows(horizon: Horizon, task: Task, normals: Array, c: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Rows of all obstacles with room for the bends of the plan c, and the group of each: its obstacle and interval."""
+    rows, right = [np.zeros((0, len(c)))], [np.zeros(0)]
+    x, u = horizon.state(task.start, c), horizon.input(task.start, c)
+    for shape, n in zip(task.shapes, normals, strict=True):
+        margin = ROOM * both_ends(bends(horizon.plant, x, u, n))
         G, h = gap_rows(horizon, task.start, n, _free(shape, task, n)[:, None] - margin)
         rows.append(G)
         right.append(h)
@@ -257,7 +262,12 @@ def _solve(
         found = nearest(np.vstack([G, hard[0]]), np.concatenate([h, hard[1]]), active)
         return found.x, np.zeros(count), found.multipliers, found.active, found.steps
     except InfeasibleError:
-        soft = nearest_soft(G, h, group, hard, price)
+        try:
+            soft = nearest_soft(G, h, group, hard, price)
+        except InfeasibleError:
+            raise ControlError(
+                "no plan keeps the limits of the hand; raise force, speed or jump of control.constraints"
+            ) from None
         return soft.x, np.where(soft.slack > SLIGHT, soft.slack, 0.0), soft.multipliers, (), soft.steps
 
 
@@ -285,6 +295,6 @@ def _judged(
     unsafe |= broken(plant, x, u, task.limits, task.u_bar)
     last = np.flatnonzero(unsafe[H:])
     return Plan(
-        horizon, task, c, normals, slack, bend, float(multipliers.max(initial=0.0)), int((multipliers > 0).sum()),
+        horizon, task, c, normals, slack, bend, float(multipliers.max(initial=0.0)), (),
         (), 0, (), (), 0, gap, len(u) - H, 0 if len(last) == 0 else int(last[-1]) + 1,
     )  # fmt: skip

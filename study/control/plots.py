@@ -163,6 +163,10 @@ def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Fr
         files += figure_gains(study.bases, out / "errors.png")
     if study.margins is not None:
         files += style.save(bode(study.margins), out / "bode.png")
+    if study.planned is not None:
+        from softgrasp.study.control.obstacle.plots import draw_plan
+
+        files += draw_plan(study.planned, frames.picture, out)
     # rounding of the eigenvalues of the lowest modes
     noise = 1e-13 * max(float(np.abs(p).max(initial=0.0)) for p in poles.values())
     files += figure_decay(poles, out / "decay.png", noise=noise)

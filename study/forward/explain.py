@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -29,6 +29,9 @@ from softgrasp.study.forward.cautions import coarse, locking, looked_at, poisson
 from softgrasp.study.forward.result import ModelSizes, model_sizes, output_places
 from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.files import to_json
+
+if TYPE_CHECKING:  # plans are not imported where a scene asks for none
+    from softgrasp.lqr.design.constrained import PlanSizes
 
 MODES = 6
 MOST_LOOKED_AT = {2: 20_000, 3: 6_000}  # unknowns that modes and sag are computed on
@@ -115,6 +118,7 @@ class Explanation:
     mesh: MeshReport  # singular ends, and the error they leave
     coarser: int  # unknowns of the coarser copy of a large mesh that gives modes, sag and estimate [1]; 0: none
     dimension: int  # 2 or 3
+    plan: PlanSizes | None = None  # of the plan past obstacles that `control` makes; None where it makes none
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dicts, lists and numbers for JSON; what is not known is None."""
@@ -179,7 +183,17 @@ def explain_model(model: Model) -> Explanation:
         mesh=mesh_report(model, looked),
         coarser=0 if looked is model else small.layout.n_e,
         dimension=d,
+        plan=_plan(model),
     )
+
+
+def _plan(model: Model) -> PlanSizes | None:
+    """Sizes of the quadratic program of `control`. Collective."""
+    if model.scene.control is None or model.scene.control.constraints is None:
+        return None
+    from softgrasp.lqr.design.constrained import plan_sizes  # no other scene needs it
+
+    return plan_sizes(model)
 
 
 def coarser_copy(model: Model) -> Model:

@@ -54,6 +54,9 @@ def sections(result: Explanation) -> list[Section]:
         ("snapshots", f"{result.snapshot_columns} columns, {size_text(result.snapshot_bytes)}"),
         ("time", f"{t.steps} steps of {t.dt:.4g} s to {t.end:.4g} s"),
     ]
+    if (plan := result.plan) is not None:
+        program = f"{plan.variables} variables, {plan.rows} rows, {plan.intervals} intervals of {plan.grid:g} s"
+        sizes.append(("plan of control, longer where its end is not safe", f"N = {plan.N}, {program}"))
     effects = [
         (f"{name}: {verdict(e)}", ". ".join(filter(None, (e.gate.comparison, e.gate.sentence))))
         for name, e in result.effects.items()
