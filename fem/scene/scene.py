@@ -275,7 +275,8 @@ class Scene(Shown, Section):
         for name, layer in self.tissue.layers.items():
             if layer.beta is not None and effects.damping is None:
                 raise ValueError(f"tissue.layers.{name}.beta needs effects.damping; give it or drop beta")
-        check_obstacles(self.obstacle, used=effects.obstacles)
+        planned = self.control is not None and self.control.constraints is not None
+        check_obstacles(self.obstacle, used=planned or effects.obstacles)
         if effects.obstacles:
             _check_contact(self)
         if self.dimension is not None:
@@ -345,5 +346,6 @@ def check_dimension(scene: Scene, d: int) -> None:
 def scene_schema() -> dict[str, Any]:
     """JSON schema of a scene file, draft 2020-12."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema(by_alias=True)
-    schema["$defs"]["Reduction"]["properties"]["methods"]["items"]["enum"] = list(BASES)
+    own = {"type": "string", "description": "a basis of reduction.plugins"}
+    schema["$defs"]["Reduction"]["properties"]["methods"]["items"] = {"anyOf": [{"enum": list(BASES)}, own]}
     return schema

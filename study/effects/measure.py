@@ -21,6 +21,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.checksums import digest
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.run.simulate import Run, RunOptions
@@ -53,6 +54,7 @@ class MeasuredScene:
     # what PETSc's log counts as created by build, factor, start and the first step, by class
     objects: dict[str, int] = field(default_factory=dict)
     objects_in_steps: dict[str, int] = field(default_factory=dict)  # PETSc objects created by the next steps, by class
+    mesh: TissueMesh | None = None  # shared with other scenes; None where each makes its own
 
 
 def bare_output(scene: Scene) -> Scene:
@@ -133,7 +135,11 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
 
 
 def measure_builds(
-    comm: MPI.Intracomm, scenes: dict[str, Scene], repeats: int, tick: Callable[[], None]
+    comm: MPI.Intracomm,
+    scenes: dict[str, Scene],
+    repeats: int,
+    tick: Callable[[], None],
+    mesh: TissueMesh | None = None,
 ) -> dict[str, MeasuredScene]:
     """Build and factor every scene in rotated order, ``repeats`` times or for `BUILD_SECONDS`. Collective."""
     cases: dict[str, MeasuredScene] = {}
@@ -141,10 +147,10 @@ def measure_builds(
 
     def once(name: str) -> None:
         nonlocal spent
-        model = build(scenes[name], comm=comm)
+        model = build(scenes[name], comm=comm, mesh=mesh)
         with model.watch.stage("setup"):
             run = Run(model, RunOptions())
-        case = cases.setdefault(name, MeasuredScene(model))
+        case = cases.setdefault(name, MeasuredScene(model, mesh=mesh))
         for stage in ("mesh", "assembly", "setup"):
             case.seconds.setdefault(stage, []).append(model.watch.seconds[stage])
             spent += model.watch.seconds[stage]
@@ -217,14 +223,17 @@ def counting(comm: MPI.Intracomm) -> Iterator[dict[str, int]]:
     counts.update(created(comm) - before)
 
 
-def objects_of(comm: MPI.Intracomm, scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
+def objects_of(
+    comm: MPI.Intracomm, scene: Scene, mesh: TissueMesh | None = None
+) -> tuple[dict[str, int], dict[str, int]]:
     """Objects that PETSc's log sees created up to the first step of a run from rest, and in the next ones. Collective.
 
     The static solve of a start in equilibrium belongs to the start and no effect: gravity is tried with it, not before.
     Turns on PETSc's log, which takes a tenth of a short step: not before times are measured.
     """
     with counting(comm) as at_first:
-        stepper = RepeatableRun(build(scene.changed(lambda table: table["time"].update(start="rest")), comm=comm))
+        resting = scene.changed(lambda table: table["time"].update(start="rest"))
+        stepper = RepeatableRun(build(resting, comm=comm, mesh=mesh))
         stepper.run.advance_to(stepper.ts, min(1, stepper.run.steps))
     with counting(comm) as in_steps:
         stepper.run.advance_to(stepper.ts, min(1 + STEPS, stepper.run.steps))
@@ -279,12 +288,12 @@ def prove_off(name: str, before: MeasuredScene, again: MeasuredScene) -> OffProo
     prints, counts = [again.prints], [(again.objects, again.objects_in_steps)]
     with_zero = neutral(before.model.scene, name, layout.dimension)
     if with_zero is not None:
-        model = build(with_zero, comm=layout.comm)
+        model = build(with_zero, comm=layout.comm, mesh=before.mesh)
         run = Run(model, RunOptions())
         prints.append(operator_hashes(model, run))
         run.midpoint.destroy()
         if before.objects:
-            counts.append(objects_of(layout.comm, with_zero))
+            counts.append(objects_of(layout.comm, with_zero, before.mesh))
     return OffProof(
         same_operators=all(p == before.prints for p in prints),
         same_objects=not before.objects_in_steps and all(c == (before.objects, {}) for c in counts),

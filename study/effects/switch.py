@@ -64,7 +64,7 @@ def switch(scene: Scene, name: str, scales: Scales) -> Switch:
         table["effects"][name] = entry
         if name == "gravity":
             table["time"]["start"] = "rest" if on else "equilibrium"
-        elif name == "obstacles":
+        elif name == "obstacles" and not table.get("control", {}).get("constraints"):
             table.pop("obstacle")
         elif name == "damping" and on:
             for layer in table["tissue"]["layers"].values():

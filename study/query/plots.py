@@ -42,7 +42,7 @@ def figure_answer(answer: CertifiedAnswer, out: Path) -> tuple[Path, ...]:
                     about = np.maximum(np.maximum.accumulate(c.outputs_estimate.values[1:, i]), LEAST)
                     below.semilogy(run.times[1:], about, color=colour, ls=":", label="estimated")
             top.set_ylabel(f"relative to hand [{unit}]")
-            top.legend(ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
+            figure.legend(*top.get_legend_handles_labels(), loc="outside upper left", ncols=3)
             largest = float(c.outputs.values.max(initial=LEAST))
             below.set(xlabel="time [s]", ylabel="largest error so far [m]", ylim=(1e-4 * largest, 2 * largest))
             below.legend(handles=below.lines[:2], loc="lower right")
@@ -87,7 +87,7 @@ def figure_batch(answers: QueryResult, file: Path) -> tuple[Path, ...]:
             ax.plot([a, b, b, a, a], [c, c, d, d, c], color="#999999", lw=0.7)
         logarithmic = bool((lam > 0).all())
         ax.set(xscale="log" if logarithmic else "linear", yscale="log")
-        ax.set(xlabel=r"$\lambda$ [Pa]", ylabel=r"$\mu$ [Pa]")
+        ax.set(xlabel="λ [Pa]", ylabel="μ [Pa]")
         for axis in (ax.xaxis, ax.yaxis)[not logarithmic :]:
             few_ticks(axis)
         return save(figure, file)

@@ -46,8 +46,8 @@ OTHERS: dict[str, Any] = {"ls": "", "marker": ".", "ms": 4, "color": "#c4c4c4"}
 FRONT: dict[str, Any] = {"color": style.OUTLINE, "lw": 1.6, "zorder": 2}
 QUANTITIES = (
     ("error_deformation", "error of the deformation"),
-    ("error", r"error of $[q_s, v_s, q_e, v_e]$"),
-    ("error_canonical", r"error of $[q_s, p_s, q_e, p_e]$"),
+    ("error", "error of positions and velocities"),
+    ("error_canonical", "error of positions and momenta"),
     ("error_energy", "error of the energy"),
 )
 INSTANTS = 3  # at most, in the still picture
@@ -100,9 +100,7 @@ def figure_errors(
     single, look = len(quantities) == 1, looks(s.method.key for s in sweeps)
     with style.paper_style():
         size = (style.COLUMN + 1.6, 3.4 if single else 6.4)
-        figure, axes = plt.subplots(len(quantities), 1, figsize=size, sharex=True, squeeze=False)
-        bottom, top = (0.13, 0.9) if single else (0.07, 0.97)
-        figure.subplots_adjust(left=0.13, right=0.66, bottom=bottom, top=top, hspace=0.1)
+        figure, axes = plt.subplots(len(quantities), 1, figsize=size, sharex=True, squeeze=False, layout="constrained")
         for ax, (key, label) in zip(axes[:, 0], quantities, strict=True):
             ends = []
             for s in sweeps:
@@ -118,9 +116,9 @@ def figure_errors(
             style.log_axis(ax, 1.6 * TOP)
             ax.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=style.STEPS))
             style.direct_labels(ax, ends)
-        axes[-1, 0].set_xlabel("$N$, columns of the basis")
+        axes[-1, 0].set_xlabel("N, columns of the basis")
         if single and (handles := _remarks(sweeps)):
-            ax.legend(handles=handles, loc="lower left", bbox_to_anchor=(-0.1, 1.0), borderaxespad=0.2, ncols=2)
+            figure.legend(handles=handles, loc="outside upper left", ncols=2)
         return style.save(figure, out_png)
 
 
@@ -167,9 +165,9 @@ def figure_sigma(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ..
     if not groups:
         return ()
     with style.paper_style():
-        size = (style.WIDTH if len(groups) > 1 else 0.6 * style.WIDTH, 3.3)
-        figure, axes = plt.subplots(1, len(groups), figsize=size, sharey=True, squeeze=False, layout="constrained")
-        for ax, group in zip(axes[0], groups, strict=True):
+        size = (style.COLUMN + 0.9, 0.3 + 2.9 * len(groups))
+        figure, axes = plt.subplots(len(groups), 1, figsize=size, sharex=True, squeeze=False, layout="constrained")
+        for ax, group in zip(axes[:, 0], groups, strict=True):
             for s in group:
                 colour, dashes, _ = look[s.method.key]
                 label, wide = s.method.short_title, 1.2
@@ -177,9 +175,9 @@ def figure_sigma(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ..
                     shown = np.maximum(values[:SHOWN_VALUES] / values[0], LOWEST)
                     ax.plot(np.arange(1, len(shown) + 1), shown, color=colour, ls=dashes, lw=wide, label=label)
                     label, wide = "", 0.7  # of the further parts
-            ax.set(yscale="log", xlabel="number")
+            ax.set(yscale="log", ylabel="singular value over the first [1]")
             ax.legend(loc="upper right", handlelength=2.2, fontsize=6.5)
-        axes[0, 0].set_ylabel(r"singular value over the first, $\sigma_i / \sigma_1$")
+        axes[-1, 0].set_xlabel("number")
         return style.save(figure, out_png)
 
 
@@ -276,7 +274,7 @@ def figure_compare(views: Views, out_png: Path) -> tuple[Path, ...]:
     shown = instants(views)
     with style.paper_style():
         times = ", ".join(f"{views.times[k]:.2g}" for k in shown)
-        figure, axes, shot = _figure(views, f"; shown: $t$ = {times} s")
+        figure, axes, shot = _figure(views, f"; shown: t = {times} s")
         for k in shown:
             _draw(axes, shot, views, k)
         return style.save(figure, out_png)

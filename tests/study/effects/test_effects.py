@@ -16,6 +16,7 @@ import pytest
 from mpi4py import MPI
 from rich.console import Console
 
+from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import ResourceError, SolverError
 from softgrasp.fem.model.build import build
@@ -589,3 +590,18 @@ def test_show_says_what_a_proof_misses(comm: MPI.Intracomm) -> None:
     show_sections(Console(file=text, width=100), parts(dataclasses.replace(study, findings=broken)))
     assert text.getvalue().count("NOT the same") == sum(f.proof is not None for f in broken)
     assert not dataclasses.replace(study, findings=broken).to_dict()["off_is_free"]
+
+
+@pytest.mark.serial
+def test_effects_are_measured_on_the_mesh_that_a_tolerance_led_to(comm: MPI.Intracomm) -> None:
+    """The weight of the tissue, whose variant would have a mesh of its own, against two runs on the one mesh."""
+    few = ["time.steps=60", "study.repeats=1", "tissue.refine={tolerance=0.05}"]
+    scene = load_scene_collective(comm, "paper_forward", few)
+    study, model = study_effects(scene, comm), adapt.build(scene, comm=comm)
+    assert study.sizes["n_e"] == model.system.layout.n_e != build(scene, comm=comm).system.layout.n_e
+    weighing = Experiments(scene, Scales(2, *rigid_inertia(model), None), {frozenset(): model}).variant({"gravity"})
+    heavy = build(weighing, comm=comm, mesh=model.space.mesh)
+    change = compare(displacements(model, simulate(model)), displacements(heavy, simulate(heavy)))
+    (gravity,) = (f for f in study.findings if f.name == "gravity")
+    assert gravity.change is not None
+    assert gravity.change.outputs == pytest.approx(change.outputs, rel=1e-9)  # sums in another order
