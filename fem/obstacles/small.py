@@ -72,8 +72,8 @@ class SmallProblem:
 
     def resume(self, order: Array, L: Array, tally: Array, size: int) -> None:
         """Continue with a set and its factor, (m,) and (m, m), and the counts of the rounds."""
-        self._fit(size)
         m = len(order)
+        self._fit(max(size, m))
         self.order[:m], self.L[:m, :m], self.count[0], self.tally[:] = order, L.reshape(m, m), m, tally
 
     def solve(self, p: int, W: Array, q: Array, tol: float) -> Array:

@@ -112,8 +112,8 @@ def check_obstacles(obstacles: list[Obstacle] | None, used: bool) -> None:
         return
     if not used:
         raise ValueError(
-            "obstacle is given but nothing in this scene uses it; set effects.obstacles = true for contact, or drop "
-            "[[obstacle]]"
+            "obstacle is given but nothing in this scene uses it; set effects.obstacles = true for contact, give "
+            "control.constraints, or drop [[obstacle]]"
         )
     names = obstacle_names(obstacles)
     for i, name in enumerate(names):

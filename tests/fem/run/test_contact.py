@@ -18,8 +18,6 @@ from softgrasp.fem.obstacles.small import SmallProblem
 from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.scene.file import load_scene
-from softgrasp.lqr.design.scene import problem
-from softgrasp.reduction.reduce import reduce
 
 SMALL = [
     "tissue.cells=[4, 8]",
@@ -225,7 +223,3 @@ def test_a_start_inside_and_a_hand_that_meets_an_obstacle_are_refused() -> None:
     held = model.system.layout.held[0].tolist()
     with pytest.raises(SoftgraspError, match="the hand meets obstacle 'disc1' at t = 0 s"):
         run(f"obstacle=[{{kind='disc', center={held}, radius=0.01}}]")
-    with pytest.raises(SceneError, match=r"control cannot go with effects.obstacles yet"):
-        problem(model)
-    with pytest.raises(SceneError, match=r"a reduced model cannot go with effects.obstacles yet"):
-        reduce(model, run(TABLE, BETA, "time.steps=2"))
