@@ -41,11 +41,11 @@ class OutputColumn:
         return "N m" if self.rotation else "N"
 
     @property
-    def formula(self) -> str:
+    def title(self) -> str:
         """Name and axis for a figure."""
         if self.rotation:
-            return f"{self.name}, about ${self.axis[1]}$"
-        return f"{self.name}, ${self.axis}$" if self.axis else self.name
+            return f"{self.name}, about {self.axis[1]}"
+        return f"{self.name}, {self.axis}" if self.axis else self.name
 
 
 Columns = tuple[OutputColumn, ...]

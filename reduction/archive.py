@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 from mpi4py import MPI
-from scipy.spatial import cKDTree
 
 from softgrasp.fem.errors import no_pipe, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
@@ -284,6 +283,8 @@ def _write_rows(reconstruction: Reconstruction, path: Path) -> None:
 
 def read_reconstruction(file: h5py.File, layout: BlockLayout) -> Reconstruction:
     """Rows of this rank, found by the coordinates of its nodes."""
+    from scipy.spatial import cKDTree  # slow to import
+
     path, d, group = file.filename, layout.dimension, _group(file)
     if group not in file:
         raise ModelError(f"{path} holds no basis on the mesh; load it without a layout, or reduce the scene again")

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from softgrasp.fem.errors import MeshError
 
@@ -151,6 +150,8 @@ def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
 
     ``tolerance``: share of h, < 1/2 [1].
     """
+    from scipy.spatial import cKDTree  # slow to import, and for mesh files alone
+
     owners = cells[np.unique(facets.cells[facets.outer])]
     h = np.full(len(points), np.inf)
     for i, j in combinations(range(cells.shape[1]), 2):
@@ -175,6 +176,8 @@ def hanging_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
 
     ``tolerance``: largest distance from the facet over its longest edge, and least from its corners [1].
     """
+    from scipy.spatial import cKDTree  # slow to import, and for mesh files alone
+
     faces, owners = facets.nodes[facets.outer], cells[facets.cells[facets.outer]]
     nodes = np.unique(faces)
     middles = points[faces].mean(axis=1)

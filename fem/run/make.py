@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from softgrasp.fem.run.inexact import InexactMidpoint
 from softgrasp.fem.run.midpoint import TissueMidpoint
+from softgrasp.fem.solve.costs import STEP_RTOL
 from softgrasp.fem.solve.solvers import ITERATIVE, Reproducible, SolverName
 from softgrasp.fem.system import BlockSystem
 
 
 def make_midpoint(
-    system: BlockSystem, dt: float, solver: SolverName, rtol: float = 1e-10, reproducible: Reproducible = "auto"
+    system: BlockSystem, dt: float, solver: SolverName, rtol: float | None = None, reproducible: Reproducible = "auto"
 ) -> TissueMidpoint:
-    """The step of a system, linear or of finite strain; arguments as for `TissueMidpoint`. Collective."""
+    """The step of a system, linear or of finite strain; arguments as for `TissueMidpoint`. Collective.
+
+    ``rtol``: None for that of the solver, `STEP_RTOL`; Newton's method, which has a tolerance of its own, takes 1e-4.
+    """
+    if rtol is None:
+        rtol = STEP_RTOL["stars"] if system.points is not None else STEP_RTOL.get(solver, STEP_RTOL["cg"])
     if system.points is None and solver in ITERATIVE:
         return InexactMidpoint(system, dt, solver, rtol, reproducible)
     if system.points is None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from softgrasp.fem.columns import hand_columns
 from softgrasp.fem.errors import SceneError, SolverError
@@ -71,6 +70,8 @@ class Profile:
         """The hand on a time grid; a table is joined by a cubic spline, at rest at both ends."""
         t = self.end * np.arange(steps + 1) / steps
         if self.table is not None:
+            from scipy.interpolate import CubicSpline  # brings scipy.optimize
+
             spline = CubicSpline(*self.table, bc_type="clamped")
             q, v = spline(t), spline(t, 1)
         else:

@@ -126,8 +126,10 @@ class Time(Section):
         "rest", description="start undeformed, or in equilibrium under gravity [no unit]"
     )
     solver: Literal["auto", "cholesky", "mumps", "cg", "stars"] = Field("auto", description="linear solver [no unit]")
-    rtol: Annotated[float, Field(gt=0, lt=1)] = Field(
-        1e-4, description="relative tolerance [1] of each step with cg or stars; energy is exact at any"
+    rtol: Dropped[Annotated[float, Field(gt=0, lt=1)]] = Field(
+        None,
+        description="relative residual [1] at which cg or stars ends a step; default 1e-8 with cg, 1e-4 with stars and "
+        "at finite strain; energy is exact at any",
     )
     reproducible: Literal["auto"] | bool = Field(
         "auto",

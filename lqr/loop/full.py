@@ -130,7 +130,7 @@ class ClosedLoop:
         problem: plant, outputs and weights.
         dt: time step [s].
         solver: cholesky, mumps, cg, stars or auto.
-        rtol: tolerance of cg and stars.
+        rtol: relative residual at which cg or stars ends a step [1]; None for 1e-8 with cg, 1e-4 with stars.
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 
     Raises:
@@ -149,7 +149,7 @@ class ClosedLoop:
         problem: RiccatiProblem,
         dt: float,
         solver: str = "auto",
-        rtol: float = 1e-4,
+        rtol: float | None = None,
         reproducible: Reproducible = "auto",
     ) -> None:
         if not (np.isfinite(dt) and dt > 0):

@@ -162,7 +162,7 @@ def pole_sets(study: ControlStudy) -> dict[str, np.ndarray]:
     }
     best = None if basis is None else basis.best(fast_order(design.problem.layout.n_s))
     if best is not None and best.gain is not None:
-        sets[f"a-priori gain, $N = {best.N}$"] = loop.poles(best.gain.block)
+        sets[f"a-priori gain, N = {best.N}"] = loop.poles(best.gain.block)
     return {name: p[np.argsort(np.abs(p))][: 2 * SHOWN_MODES] for name, p in sets.items()}
 
 

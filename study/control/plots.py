@@ -31,9 +31,9 @@ LOOKS = {
     "structured": (style.HAND, "-", "P"),
 }
 QUANTITIES = (
-    ("error_P", "error of $P$"),
-    ("error_K", "error of the gain $K$"),
-    ("cost_excess", r"excess cost $J(\hat K)/J(K) - 1$"),
+    ("error_P", "error of P"),
+    ("error_K", "error of the gain K"),
+    ("cost_excess", "excess cost, over the optimal one"),
 )
 TOP = 1.0  # errors above 100 % are not drawn
 LOWEST = 1e-12  # smaller excess cost is rounding
@@ -79,7 +79,7 @@ def figure_gains(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ...]
             ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
             ax.set_ylabel(label)
             style.direct_labels(ax, ends)
-        axes[-1].set_xlabel("$N$, order of the reduced equation")
+        axes[-1].set_xlabel("N, order of the reduced equation")
         if bad:
             text = "unstable loop; on the edge: error above 1"
             figure.legend(handles=[Line2D([], [], label=text, **CROSS)], loc="upper left", borderaxespad=0.2)
@@ -112,13 +112,13 @@ def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, ...]
                 ink = "white" if norm(value) > 0.45 else "black"
                 ax.text(*place, f"{value:.0e}", ha="center", va="center", fontsize=6.5, color=ink)
             ax.plot(*places[~stable].T, "x", color=style.UNSTABLE, ms=8, mew=1.6)
-            ax.set(xscale="log", yscale="log", ylabel=r"$\mu$ [Pa]", title=f"{TITLES[r.name]}, $N = {r.N}$")
+            ax.set(xscale="log", yscale="log", ylabel="μ [Pa]", title=f"{TITLES[r.name]}, N = {r.N}")
             ax.margins(0.25)
             for axis, settings in zip((ax.xaxis, ax.yaxis), places.T, strict=True):  # ticks at the settings themselves
                 axis.set_ticks(np.unique(settings), [f"{v:.3g}" for v in np.unique(settings)])
                 axis.set_minor_formatter(NullFormatter())
                 axis.set_ticks([], minor=True)
-        axes[-1, 0].set_xlabel(r"$\lambda$ [Pa]")
+        axes[-1, 0].set_xlabel("λ [Pa]")
         if picture is not None:
             figure.colorbar(picture, ax=axes[:, 0].tolist(), label=QUANTITIES[2][1])
         return style.save(figure, out_png)
@@ -175,7 +175,7 @@ def compared(loops: LoopRuns) -> dict[str, tuple[Array, Array]]:
     ran = [(r, r.run) for r in loops.reduced if r.run is not None]
     own = [x for x in ran if x[0].method == A_PRIORI]
     paper = sorted((x for x in ran if x[0].method != A_PRIORI), key=lambda x: (float(x[1].cost[-1]), x[0].method))
-    return {f"{TITLES[r.method]}, $N = {r.N}$": (run.outputs, run.inputs) for r, run in (*own, *paper[-1:])}
+    return {f"{TITLES[r.method]}, N = {r.N}": (run.outputs, run.inputs) for r, run in (*own, *paper[-1:])}
 
 
 def _move(out: Path, study: ControlStudy, frames: Frames) -> list[Path]:

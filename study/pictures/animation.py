@@ -19,7 +19,7 @@ from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.fem.owned import note
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, legend, make_axes, make_shot, name_layers
 from softgrasp.study.pictures.shapes import speed_up
-from softgrasp.study.pictures.style import TARGET, colour_map, paper_style
+from softgrasp.study.pictures.style import TARGET, colour_map, fit, paper_style
 
 MOST_FRAMES = 60
 TICKS = 2  # shortest time of a frame [1/100 s]; viewers slow down what is shorter
@@ -89,7 +89,7 @@ def film(
     """
     canvas, images = figure.canvas, []
     figure.set_dpi(DPI)
-    _fit(figure, figure.get_tightbbox().padded(0.08))
+    fit(figure, 0.08)
     for artist in (*others, *(line for ax in axes for line in ax.lines)):
         artist.set_animated(True)  # no part of the background
     canvas.draw()
@@ -107,22 +107,6 @@ def film(
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
     plt.close(figure)
     return images
-
-
-def _fit(figure: Any, box: Any) -> None:
-    """Give a figure the size of a box [inch], everything in it where it is."""
-    figure.set_layout_engine("none")
-    size = figure.get_size_inches()
-    scale, corner = size / box.size, box.min / box.size
-    places = [(ax, ax.get_position().get_points() * scale - corner) for ax in figure.axes]
-    anchors = [(placed, placed.get_bbox_to_anchor().min / figure.dpi / box.size - corner) for placed in figure.legends]
-    for text in figure.texts:
-        text.set_position(np.array(text.get_position()) * scale - corner)
-    figure.set_size_inches(*box.size)
-    for ax, (low, high) in places:
-        ax.set_position((*low, *(high - low)))
-    for placed, anchor in anchors:
-        placed.set_bbox_to_anchor(tuple(anchor), transform=figure.transFigure)
 
 
 def write_gif(gif: bytes, out_gif: Path) -> Path:

@@ -167,8 +167,8 @@ def make_axes(
         ax.xaxis.set_major_locator(MaxNLocator(int(np.clip(w / 0.5, 2, 6)), steps=style.STEPS))
         ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(h / 0.4, 2, 6)), steps=style.STEPS))
         ax.tick_params(labelbottom=i // columns == rows - 1, labelleft=i % columns == 0)
-        ax.set_xlabel("$x$ [m]" if i // columns == rows - 1 else "")
-        ax.set_ylabel("$y$ [m]" if i % columns == 0 else "")
+        ax.set_xlabel("x [m]" if i // columns == rows - 1 else "")
+        ax.set_ylabel("y [m]" if i % columns == 0 else "")
     if solid:
         _tripod(figure, size, scale, corner == "top")
     return figure, axes
@@ -213,7 +213,7 @@ def legend(figure: Any, axes: list[Any], shot: Shot) -> None:
 
 
 def _time(t: float) -> str:
-    return f"$t$ = {t:.3g} s"
+    return f"t = {t:.3g} s"
 
 
 def _upright(shot: Shot) -> bool:
@@ -262,7 +262,7 @@ def _tripod(figure: Any, size: tuple[float, float], scale: float, top: bool) -> 
     for name, end in zip("xyz", ends, strict=True):
         ax.annotate("", end, (0.0, 0.0), arrowprops={"arrowstyle": "-", "lw": 0.8, "shrinkA": 0, "shrinkB": 0})
         away = 5 * end / np.linalg.norm(end)
-        ax.annotate(f"${name}$", end, away, textcoords="offset points", ha="center", va="center")
+        ax.annotate(name, end, away, textcoords="offset points", ha="center", va="center")
     ax.annotate(
         f"{length:g} m each", (0.0, 0.0), (0, -9), xycoords="axes fraction", textcoords="offset points", va="top"
     )

@@ -124,7 +124,7 @@ def _output_panels(runs: Runs, columns: Columns, aim: Array | None) -> list[_Pan
     scaled = ((f"outputs [{unit}]", factor, parts[0]), ("rotation [rad]", 1.0, parts[1]))
     return [
         _Panel(
-            label, [scale * y[:, part] for y, _ in runs.values()], [columns[j].formula for j in part],
+            label, [scale * y[:, part] for y, _ in runs.values()], [columns[j].title for j in part],
             () if aim is None else [scale * value for value in dict.fromkeys(aim[part].tolist())],
         )
         for label, scale, part in scaled if part
@@ -135,9 +135,9 @@ def _input_panels(runs: Runs, limits: npt.ArrayLike | None, dimension: int | Non
     n = next(iter(runs.values()))[1].shape[1]
     d = n if dimension is None else min(dimension, n)
     bounds = np.broadcast_to(np.asarray(np.inf if limits is None else limits, dtype=np.float64), n)
-    forces = [f"$u_{AXES[j] if d <= len(AXES) else j + 1}$" for j in range(d)]
+    forces = [f"force, {AXES[j] if d <= len(AXES) else j + 1}" for j in range(d)]
     about = ["z"] if n - d == 1 else [*AXES, *map(str, range(4, n - d + 1))]
-    torques = [f"torque, ${a}$" for a in about[: n - d]]
+    torques = [f"torque, {a}" for a in about[: n - d]]
     parts = (("force [N]", slice(0, d), forces), ("torque [N m]", slice(d, n), torques))
     return [
         _Panel(
@@ -213,8 +213,8 @@ def figure_decay(poles: Mapping[str, Poles], out_png: Path, *, noise: float = 0.
         if not swings(together).all():
             ax.axvline(np.sqrt(axis_strip * left), color="#bbbbbb", lw=0.6)
             ax.text(axis_strip, high, "real", ha="center", va="bottom", fontsize=8, color=style.OUTLINE)
-        ax.set_xlabel(r"frequency $|\mathrm{Im}\,p|$ [1/s]")
-        ax.set_ylabel(r"decay rate $-\mathrm{Re}\,p$ [1/s]")
+        ax.set_xlabel("frequency |Im p| [1/s]")
+        ax.set_ylabel("decay rate −Re p [1/s]")
         few_ticks(ax.xaxis)
         few_ticks(ax.yaxis)
         figure.legend(loc="outside upper center", ncols=2, columnspacing=1.2, handletextpad=0.2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -12,6 +13,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from cycler import cycler
+from PIL import Image
 
 from softgrasp.fem.owned import note
 from softgrasp.study.pictures import PDF
@@ -19,7 +21,8 @@ from softgrasp.study.pictures import PDF
 if "inline" not in os.environ.get("MPLBACKEND", ""):  # a notebook shows figures by its own
     mpl.use("Agg")
 import matplotlib.pyplot as plt
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullFormatter
 
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # Okabe and Ito
 SKY = "#56B4E9"  # of the same palette
@@ -32,6 +35,8 @@ COLUMN, WIDTH = 3.4, 7.0  # [inch], one column and both of a two-column page
 FULL: dict[str, Any] = {"color": "#888888", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}  # a full run beside reduced ones
 DPI = 150
 STEPS = [1, 2, 5, 10]  # between ticks
+MARGIN = 0.04  # around a picture [inch]
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @contextmanager
@@ -101,13 +106,57 @@ def direct_labels(ax: Any, ends: Sequence[tuple[float, float, str, str]], size: 
         )  # fmt: skip
 
 
+class Powers(LogFormatterSciNotation):
+    """Numbers of a logarithmic axis as plain text, 2×10⁻³: formulas cost a third of a figure."""
+
+    def __call__(self, x: float, pos: Any = None) -> str:
+        """The text beside the tick at x."""
+        text = re.sub(r"\^\{(.*?)\}", lambda power: power[1].translate(RAISED), super().__call__(x, pos))
+        return re.sub(r"\$|\\mathdefault|[{}]", "", text).replace(r"\times", "×")
+
+
+def _plain_powers(axis: Any) -> None:
+    if type(axis.get_major_formatter()) is LogFormatterSciNotation:
+        axis.set_major_formatter(Powers())
+    if type(axis.get_minor_formatter()) is LogFormatterSciNotation:
+        axis.set_minor_formatter(Powers(labelOnlyBase=False))
+
+
+def fit(figure: Any, margin: float) -> None:
+    """Give a figure the size of what is in it and a margin [inch], everything where it is."""
+    if (engine := figure.get_layout_engine()) is not None:
+        engine.execute(figure)
+    figure.set_layout_engine("none")
+    box = figure.get_tightbbox().padded(margin)
+    size = figure.get_size_inches()
+    scale, corner = size / box.size, box.min / box.size
+    places = [(ax, ax.get_position().get_points() * scale - corner) for ax in figure.axes]
+    anchors = [
+        (each, each.get_bbox_to_anchor().get_points() / figure.dpi / box.size - corner) for each in figure.legends
+    ]
+    for text in figure.texts:
+        text.set_position(np.array(text.get_position()) * scale - corner)
+    figure.set_size_inches(*box.size)
+    for ax, (low, high) in places:
+        ax.set_position((*low, *(high - low)))
+    for legend, (low, high) in anchors:
+        legend.set_bbox_to_anchor((*low, *(high - low)), transform=figure.transFigure)
+
+
 def save(figure: Any, out_png: Path) -> tuple[Path, ...]:
     """Write the figure as PNG and, where :data:`PDF` is set, beside it as PDF; close it and return the names."""
     files = (out_png, out_png.with_suffix(".pdf")) if PDF.get() else (out_png,)
     note(*files)
+    for ax in figure.axes:
+        for axis in (ax.xaxis, ax.yaxis):
+            _plain_powers(axis)
+    canvas: Any = FigureCanvasAgg(figure)
     with paper_style():
-        for file in files:
-            figure.savefig(file, bbox_inches="tight", pad_inches=0.04)
+        fit(figure, MARGIN)  # Matplotlib's own bbox_inches="tight" lays out and draws twice
+        canvas.draw()
+        Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).save(out_png, dpi=(DPI, DPI))
+        for file in files[1:]:
+            figure.savefig(file)
     plt.close(figure)
     return files
 

@@ -65,12 +65,12 @@ def traces(
         for k, i in enumerate(shown):
             style = ("-", "-.", ":")[bodies.index(columns[i].name) % 3]
             look: dict[str, Any] = {"color": CYCLE[axes_of[i]], "ls": style}
-            axes[0].plot(times, factors[0][0] * outputs[:, i], label=columns[i].formula, **look)
+            axes[0].plot(times, factors[0][0] * outputs[:, i], label=columns[i].title, **look)
             axes[1].plot(times, factors[1][0] * relative[:, k], **look)
         # The hand last: its thin dashes lie on the lines of the outputs.
         for j in np.flatnonzero(np.abs(q_s[:, :d]).max(axis=0) > 0).tolist():
             look = {"color": HAND, "ls": ((0, (4, 3)), (0, (1, 1.5)), (0, (4, 2, 1, 2)))[j], "lw": 0.8}
-            axes[0].plot(times, factors[0][0] * q_s[:, j], label=f"hand, ${'xyz'[j]}$", **look)
+            axes[0].plot(times, factors[0][0] * q_s[:, j], label=f"hand, {'xyz'[j]}", **look)
         axes[0].set_ylabel(f"displacement [{factors[0][1]}]")
         if shown:
             axes[1].set_ylabel(f"relative to hand [{factors[1][1]}]")

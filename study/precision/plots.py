@@ -149,7 +149,7 @@ def _orders(space: Any, time: Any, points: Sequence[ForwardPoint], slopes: Seque
         fitted = next((s for s in slopes if s.series == name and "n_e" in s.against), None)
         label = name if fitted is None else f"{name}: {-fitted.power:.2f} ({-(fitted.expected or 0):.2g})"
         _curve(space, line, "n_e", lw=0.9, label=label, **_look(line[0]))
-    _axes_log(space, "tissue unknowns $n_e$", "error")
+    _axes_log(space, "tissue unknowns", "error")
     for line in over_steps(points).values():
         _curve(time, line, "steps", "error_time", **(_look(line[0]) | {"ms": 2.4}), **THIN)
     powers = [s.power for s in slopes if s.against == "change in time against steps"]
@@ -264,7 +264,7 @@ def figure_reduced_riccati(points: Sequence[ReducedRiccatiPoint], paper: bool, o
         look[name] = {"color": colour, "ls": dashes, "lw": 1.0, "marker": marker, "ms": 3.4, "mfc": "none"}
     with paper_style():
         figure, grid = plt.subplots(2, 2, figsize=(WIDTH, 5.0), sharey="row", sharex="col", layout="constrained")
-        values = {"error": "error of the gain $K$", "cost_excess": "excess cost"}
+        values = {"error": "error of the gain K", "cost_excess": "excess cost"}
         for row, (y, label) in zip(grid, values.items(), strict=True):
             for name, line in series_of(sorted(good, key=lambda p: p.N)).items():
                 _basis_lines(row, line, y, look[name] | {"mew": 0.9})
@@ -274,7 +274,7 @@ def figure_reduced_riccati(points: Sequence[ReducedRiccatiPoint], paper: bool, o
             front = _front(row[1], [p for p in good if getattr(p, y) <= TOP], y=y)
             mark = _mark(row[1:], paper, PAPER_SMALL, f"paper, {1e3 * PAPER_SMALL:.0f} ms at N = {PAPER_N}")
             _axes_log(row[1], "time of the reduced equation [s]", "")
-            _axes_log(row[0], "$N$", label)
+            _axes_log(row[0], "N", label)
             row[0].set_xscale("linear")
             row[0].xaxis.set_major_locator(MaxNLocator(6, integer=True))
             row[0].set_ylim(top=1.6 * TOP)

@@ -89,7 +89,7 @@ class RunPoint(WorkPoint):
     @property
     def setting(self) -> Setting:
         """Of the full run, or of that behind a reduced model."""
-        return Setting(self.cells, self.order, self.steps, self.solver, self.rtol or 1e-10, self.refine)
+        return Setting(self.cells, self.order, self.steps, self.solver, self.rtol, self.refine)
 
     @property
     def parameters(self) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from math import ceil, floor, isfinite, log10
 
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.costs import STEP_RTOL
 from softgrasp.study.precision.fit import interpolate, usable
 from softgrasp.study.precision.forward import over_steps, step_counts
 from softgrasp.study.precision.points import ForwardPoint, ReducedPoint, RiccatiPoint, RunPoint, WorkPoint
@@ -169,7 +170,7 @@ def _halved[P: WorkPoint](name: str, point: P | None, others: Sequence[P], error
 
 def _solver(scene: Scene, forward: Sequence[ForwardPoint]) -> list[Source]:
     """How far the scene's solver is from another one on the same mesh and steps."""
-    iterative, rtol = scene.time.solver == "cg", scene.time.rtol
+    iterative, rtol = scene.time.solver == "cg", scene.time.rtol or STEP_RTOL["cg"]
     own = [p for p in forward if p.error_solver is not None and (p.solver == "cg") == iterative]
     if iterative:
         own = sorted(own, key=lambda p: abs(log10((p.rtol or rtol) / rtol)))[:1]

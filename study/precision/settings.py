@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.costs import STEP_RTOL
 
 LEAST_STEPS = 4  # of a run
 Refine = float | Literal["off", "scene"]
@@ -24,7 +25,7 @@ class Setting:
     order: int  # of the displacement, 1 to 3
     steps: int  # equal time steps
     solver: str = "auto"  # linear solver
-    rtol: float = 1e-10  # tolerance of an iterative one
+    rtol: float | None = None  # relative residual at which an iterative one ends a step [1]; None for its default
     # tolerance of the a-priori graded mesh, "off" for even cells or those of a file, "scene" for the scene's own
     # [tissue.refine]
     refine: Refine = "off"
@@ -38,14 +39,20 @@ class Setting:
         return f"{shape if self.refine == 'off' else f'graded {self.refine:.2g}'}, P{self.order}"
 
     @property
+    def tolerance(self) -> float | None:
+        """Relative residual at which a step ends [1]; None where the solver is direct or chosen by size."""
+        return (self.rtol or STEP_RTOL[self.solver]) if self.solver in STEP_RTOL else None
+
+    @property
     def entries(self) -> dict[str, Any]:
-        """All by name; a direct solver has no tolerance."""
-        return asdict(self) | {"rtol": self.rtol if self.solver == "cg" else None}
+        """All by name."""
+        return asdict(self) | {"rtol": self.tolerance}
 
     @property
     def label(self) -> str:
         """All in words."""
-        tail = "" if self.solver == "auto" else f", {self.solver}" + (f" {self.rtol:g}" if self.solver == "cg" else "")
+        tail = "" if self.solver == "auto" else f", {self.solver}"
+        tail += "" if self.tolerance is None else f" {self.tolerance:g}"
         return f"{self.mesh}, {self.steps} steps{tail}"
 
     @property
@@ -66,7 +73,7 @@ class Setting:
             mesh = [f"tissue.refine={{tolerance={self.refine:g},passes=0}}"]
         elif self.refine == "off" and scene.tissue.refine is not None:
             mesh.append("tissue.refine=false")
-        rtol = [f"time.rtol={self.rtol:g}"] if self.solver == "cg" else []
+        rtol = [] if self.tolerance is None else [f"time.rtol={self.tolerance:g}"]
         return [*mesh, f"tissue.order={self.order}", f"time.steps={self.steps}", f"time.solver={self.solver}", *rtol]
 
     @property

@@ -87,7 +87,7 @@ def figure_batch(answers: QueryResult, file: Path) -> tuple[Path, ...]:
             ax.plot([a, b, b, a, a], [c, c, d, d, c], color="#999999", lw=0.7)
         logarithmic = bool((lam > 0).all())
         ax.set(xscale="log" if logarithmic else "linear", yscale="log")
-        ax.set(xlabel=r"$\lambda$ [Pa]", ylabel=r"$\mu$ [Pa]")
+        ax.set(xlabel="λ [Pa]", ylabel="μ [Pa]")
         for axis in (ax.xaxis, ax.yaxis)[not logarithmic :]:
             few_ticks(axis)
         return save(figure, file)

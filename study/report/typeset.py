@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from latex2mathml.converter import convert
 from markupsafe import Markup, escape
 
 from softgrasp.study.report.equation import Equation
@@ -13,6 +12,8 @@ from softgrasp.study.report.equation import Equation
 
 def prose(text: str) -> Markup:
     """Text with formulas between dollars, as HTML."""
+    from latex2mathml.converter import convert  # brings an HTTP client
+
     parts = re.split(r"\$(.*?)\$", text)
     return Markup("").join(Markup(convert(part)) if i % 2 else escape(part) for i, part in enumerate(parts))
 

@@ -47,12 +47,12 @@ def figure_box(own: Size, out_png: Path) -> tuple[Path, ...]:
             colours = np.maximum(values[key], LEAST)
             picture = ax.scatter(lam, mu, s=190, marker="s", norm=norm, cmap="viridis_r", c=colours)
             span = f"{np.nanmin(values[key]):.1e} to {np.nanmax(values[key]):.1e}"
-            ax.set(xscale="log", yscale="log", xlabel=r"$\lambda$ [Pa]", title=f"{title}\n{span}")
+            ax.set(xscale="log", yscale="log", xlabel="λ [Pa]", title=f"{title}\n{span}")
             ax.margins(0.14)
             for axis, places in ((ax.xaxis, lam), (ax.yaxis, mu)):
                 axis.set_ticks(sorted(set(places)), [f"{x:.3g}" for x in sorted(set(places))])
                 axis.set_ticks([], minor=True)
-        axes[0, 0].set_ylabel(r"$\mu$ [Pa]")
+        axes[0, 0].set_ylabel("μ [Pa]")
         bar = figure.colorbar(picture, ax=axes[0].tolist(), label="relative error")
         few_ticks(bar.ax.yaxis)
         return save(figure, out_png)
@@ -74,7 +74,7 @@ def figure_greedy(certified: CertifiedModel, tolerance: float, out_png: Path) ->
             label = "larger than the deformation"
             left.plot(np.array(k)[~known], np.ones((~known).sum()), "^", color=BLUE, mfc="none", label=label, **top)
         left.axhline(tolerance, color=UNSTABLE, lw=0.9, ls="--", label=f"tolerance {tolerance:g}")
-        left.set(xlabel="modes $k$", ylabel="relative bound")
+        left.set(xlabel="modes k", ylabel="relative bound")
         left.grid(axis="y", color="#e6e6e6", lw=0.5)
         few_ticks(left.yaxis)
         left.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0))
@@ -85,7 +85,7 @@ def figure_greedy(certified: CertifiedModel, tolerance: float, out_png: Path) ->
         for place, numbers in places.items():
             text = ", ".join(map(str, numbers[:3])) + ("..." if len(numbers) > 3 else "")
             right.annotate(text, place, xytext=(3, 3), textcoords="offset points", fontsize=6.5)
-        right.set(xscale="log", yscale="log", xlabel=r"$\lambda$ [Pa]", ylabel=r"$\mu$ [Pa]", title="trained at")
+        right.set(xscale="log", yscale="log", xlabel="λ [Pa]", ylabel="μ [Pa]", title="trained at")
         if box is not None:
             right.set(xlim=(box.lam[0] / 1.25, box.lam[1] * 1.5), ylim=(box.mu[0] / 1.4, box.mu[1] * 1.5))
             (a, b), (c, d) = box.lam, box.mu
@@ -106,8 +106,8 @@ def figure_sizes(check: BoxCheck, tolerance: float, out_png: Path) -> tuple[Path
                 colour, span = GREEN if size is check.own else BLUE, [values.min(), values.max()]
                 left.plot([size.k] * 2, span, color=colour, lw=3, alpha=0.45, solid_capstyle="butt")
                 left.plot(size.k, np.median(values), "_", color=colour, ms=11, mew=1.8)
-        title = f"green: the model as built, $k = {check.own.k}$, $k_2 = {check.own.k2}$"
-        left.set(yscale="log", xlabel="modes $k$ of the answer", ylabel="bound / true error", title=title)
+        title = f"green: the model as built, k = {check.own.k}, k₂ = {check.own.k2}"
+        left.set(yscale="log", xlabel="modes k of the answer", ylabel="bound / true error", title=title)
         left.set_ylim(bottom=0.9)
         left.xaxis.set_major_locator(MaxNLocator(integer=True))
         left.axhline(1.0, color="#888888", lw=0.9)
@@ -121,7 +121,7 @@ def figure_sizes(check: BoxCheck, tolerance: float, out_png: Path) -> tuple[Path
         right.axhline(tolerance, color=UNSTABLE, lw=0.9, ls="--", label=f"tolerance {tolerance:g}")
         for i, (time, size) in enumerate(zip(times, check.sizes, strict=True)):
             place, beside = (time, size.largest("bound")), (5, -8 if i % 2 else 2)  # neighbours may stand close
-            right.annotate(f"$k = {size.k}$", place, xytext=beside, textcoords="offset points", fontsize=6.5)
+            right.annotate(f"k = {size.k}", place, xytext=beside, textcoords="offset points", fontsize=6.5)
         right.set(xscale="log", yscale="log", xlabel="time of an answer [ms]", ylabel="largest relative error")
         right.grid(axis="y", color="#e6e6e6", lw=0.5)
         few_ticks(right.xaxis)

@@ -46,8 +46,8 @@ OTHERS: dict[str, Any] = {"ls": "", "marker": ".", "ms": 4, "color": "#c4c4c4"}
 FRONT: dict[str, Any] = {"color": style.OUTLINE, "lw": 1.6, "zorder": 2}
 QUANTITIES = (
     ("error_deformation", "error of the deformation"),
-    ("error", r"error of $[q_s, v_s, q_e, v_e]$"),
-    ("error_canonical", r"error of $[q_s, p_s, q_e, p_e]$"),
+    ("error", "error of positions and velocities"),
+    ("error_canonical", "error of positions and momenta"),
     ("error_energy", "error of the energy"),
 )
 INSTANTS = 3  # at most, in the still picture
@@ -118,7 +118,7 @@ def figure_errors(
             style.log_axis(ax, 1.6 * TOP)
             ax.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=style.STEPS))
             style.direct_labels(ax, ends)
-        axes[-1, 0].set_xlabel("$N$, columns of the basis")
+        axes[-1, 0].set_xlabel("N, columns of the basis")
         if single and (handles := _remarks(sweeps)):
             ax.legend(handles=handles, loc="lower left", bbox_to_anchor=(-0.1, 1.0), borderaxespad=0.2, ncols=2)
         return style.save(figure, out_png)
@@ -179,7 +179,7 @@ def figure_sigma(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ..
                     label, wide = "", 0.7  # of the further parts
             ax.set(yscale="log", xlabel="number")
             ax.legend(loc="upper right", handlelength=2.2, fontsize=6.5)
-        axes[0, 0].set_ylabel(r"singular value over the first, $\sigma_i / \sigma_1$")
+        axes[0, 0].set_ylabel("singular value over the first")
         return style.save(figure, out_png)
 
 
@@ -276,7 +276,7 @@ def figure_compare(views: Views, out_png: Path) -> tuple[Path, ...]:
     shown = instants(views)
     with style.paper_style():
         times = ", ".join(f"{views.times[k]:.2g}" for k in shown)
-        figure, axes, shot = _figure(views, f"; shown: $t$ = {times} s")
+        figure, axes, shot = _figure(views, f"; shown: t = {times} s")
         for k in shown:
             _draw(axes, shot, views, k)
         return style.save(figure, out_png)

@@ -73,7 +73,7 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> V
         states = vertex_displacement(model, np.nan_to_num(z), motion.q_s[steps].T)
         if states is not None:
             state = "" if point.stable else ", unstable"
-            title = f"{s.method.title}, $N$ = {point.N}{state}\ndeformation error {point.error_deformation:.1e}"
+            title = f"{s.method.title}, N = {point.N}{state}\ndeformation error {point.error_deformation:.1e}"
             views.append(View(title, states))
     modes = [(s.method.title, _modes(model, s.models[p.N]), s.method.frame == "absolute") for s, p in modes_of(sweeps)]
     if picture is None or full is None:

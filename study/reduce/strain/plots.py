@@ -42,14 +42,14 @@ def figure_strain_errors(study: StrainStudy, out_png: Path) -> tuple[Path, ...]:
                 if f is study.families[-1] and points:
                     _pair(right, [p.cells for p in points], points, colour, f"N = {N}, {f.title}")
                     right.axhline(points[0].error_galerkin, ls=":", color=colour)
-        for ax, label in ((left, "$N$"), (right, "sampled cells")):
+        for ax, label in ((left, "N"), (right, "sampled cells")):
             ax.axhline(study.linear, **style.FULL)
             ax.set_xlabel(label)
             style.log_axis(ax, None)
             ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.2, labelspacing=0.25)
         at = {"xy": (0.99, study.linear), "xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
         right.annotate("linear elasticity", **at, fontsize=6.5)
-        left.set_ylabel("error of the deformation $z$")
+        left.set_ylabel("error of the deformation z")
         return tuple(style.save(figure, out_png))
 
 
@@ -91,5 +91,5 @@ def figure_cells(picture: PictureMesh, models: Sequence[StrainModel], out_png: P
             ax.set_aspect("equal")
             ax.axis("off")
         scale = ScalarMappable(norm, style.colour_map())
-        figure.colorbar(scale, ax=list(axes[0]), shrink=0.7, label=r"weight $\xi$ of a cell")
+        figure.colorbar(scale, ax=list(axes[0]), shrink=0.7, label="weight ξ of a cell")
         return tuple(style.save(figure, out_png))

@@ -16,6 +16,7 @@ from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.solve.guess import Previous
+from tests.helpers.random_scenes import write_scene
 
 SILICONE = ["tissue.refine=false", "tissue.order=2", "tissue.cells=[4, 3, 8]", "output.snapshots=none"]
 DRIVEN = ["effects.reaction=false", "effects.rotation=false", "motion.target=[0.2, 0.1, 0.3]"]
@@ -54,6 +55,18 @@ def test_outputs_are_those_of_a_factor(comm: MPI.Intracomm, name: str) -> None:
     exact = silicone(comm, name, "time.solver=mumps")
     assert apart(silicone(comm, name, "time.solver=stars"), exact) < 1e-4  # rtol 1e-4; measured 6e-6 to 6e-5
     assert apart(silicone(comm, name, "time.solver=stars", "time.rtol=1e-11"), exact) < 1e-9  # measured below 1e-10
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("seed", [5280, 7279, 7477])
+def test_cg_is_as_right_as_a_factor(comm: MPI.Intracomm, tmp_path: Path, seed: int) -> None:
+    """Layers of very unlike nu, up to 0.499, where residuals of 1e-4 leave 1.3e-3, 3.6e-2 and 4.1e-3."""
+    file = write_scene(seed, tmp_path)
+    run, exact = (
+        simulate(build(file, [f"time.solver={name}", "output.snapshots=none"], comm)) for name in ("cg", "mumps")
+    )
+    assert run.solver[0] == "cg"
+    assert apart(run, exact) < 1e-5  # measured 8e-8, 4.5e-7 and 9.3e-7
 
 
 @pytest.mark.serial

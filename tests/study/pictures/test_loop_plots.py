@@ -56,7 +56,7 @@ def test_histories_show_the_numbers(tmp_path: Path, drawn: list[Any]) -> None:
     assert distance.get_yscale() == "log"
     assert len(distance.lines) == 2
     texts = [t.get_text() for t in top.get_legend().get_texts()]
-    assert texts == ["tip, $x$", "tip, $y$", "target"]
+    assert texts == ["tip, x", "tip, y", "target"]
 
 
 def test_torques_get_axes_of_their_own(tmp_path: Path, drawn: list[Any]) -> None:
@@ -127,7 +127,7 @@ def test_rotations_get_axes_of_their_own(tmp_path: Path, drawn: list[Any]) -> No
     assert len({line.get_color() for line in top.lines[:6]}) == 6
     assert np.array_equal(turn.lines[0].get_ydata(), y[:, 6])
     texts = [t.get_text() for t in turn.get_legend().get_texts()]
-    assert texts == ["hand, about $x$", "hand, about $y$", "hand, about $z$", "target"]
+    assert texts == ["hand, about x", "hand, about y", "hand, about z", "target"]
 
 
 def test_distance_is_that_of_the_farthest_output() -> None:

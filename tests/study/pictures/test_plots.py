@@ -8,6 +8,7 @@ import softgrasp.fem  # noqa: F401
 from contextvars import ContextVar
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -291,3 +292,32 @@ def test_report_is_one_balanced_page(tmp_path: Path) -> None:
         assert cell in page.cells
     with pytest.raises(ValueError, match="'Bad' has 2 columns"):
         write_report(tmp_path / "x.html", title="t", summary=(), sections=[Section("Bad", rows=[(1, 2), (1, 2, 3)])])
+
+
+def test_figures_are_cut_like_matplotlibs_own_tight_ones(tmp_path: Path) -> None:
+    """Legend outside, colour bar and logarithmic axis: nothing is lost, and no text goes through the formula parser."""
+    import matplotlib.pyplot as plt
+
+    from softgrasp.study.pictures import style
+
+    def figure() -> Any:
+        figure, axes = plt.subplots(2, 1, figsize=(4, 4), layout="constrained")
+        places = axes[0].scatter([1, 2], [1e-3, 2.0], c=[0.1, 3.0], label="runs")
+        axes[0].set(yscale="log", ylabel="error")
+        axes[1].annotate("beside", (1.3, 0.5), xycoords="axes fraction", annotation_clip=False)
+        figure.colorbar(places, ax=axes.tolist(), label="colour")
+        figure.legend(loc="outside upper center", bbox_to_anchor=(0.5, 1.2))
+        return figure
+
+    with style.paper_style():
+        own = figure()
+        style.save(own, tmp_path / "own.png")
+        figure().savefig(tmp_path / "tight.png", bbox_inches="tight", pad_inches=style.MARGIN)
+    assert own.axes[0].yaxis.get_major_formatter()(1e-3) == "10⁻³"
+    images = [Image.open(tmp_path / name).convert("L") for name in ("own.png", "tight.png")]
+    # plain powers are a little narrower than formulas
+    assert np.allclose(images[0].size, images[1].size, rtol=0.03)
+    for image in images:
+        ink = ImageChops.invert(image).getbbox()
+        assert ink is not None
+        assert min(ink[0], ink[1], image.width - ink[2], image.height - ink[3]) >= 1
