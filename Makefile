@@ -7,7 +7,7 @@ BIN := .venv/bin
 STAMP := .venv/.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo paper_forward paper_accurate test test-all check lint bench hardcases paper pictures docs clean
+.PHONY: help env demo paper_forward paper_accurate test test-all check lint bench hardcases paper pictures docs docs-serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -68,6 +68,9 @@ pictures: demo ## make the README's pictures again
 
 docs: $(STAMP) ## build the documentation into out/site, with all links checked
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+docs-serve: docs ## the same on http://localhost:8000, where the search works
+	$(BIN)/python -m http.server --bind 127.0.0.1 --directory out/site 8000
 
 clean: ## remove .venv, out and caches
 	rm -rf .venv out build *.egg-info .mypy_cache .ruff_cache .import_linter_cache

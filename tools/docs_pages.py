@@ -6,6 +6,7 @@ A hook of MkDocs; `make docs` runs it.
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,13 @@ from typing import Any
 import jupytext
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 import softgrasp
 from softgrasp.fem.scene.scene import scene_schema
 
 ROOT = Path(__file__).parents[1]
+DEMOS = sorted((ROOT / "demos").glob("demo_*.py"))
 ROOMS = {"fem": "Scene, model, run", "reduction": "Reduced models", "lqr": "Control", "study": "Many runs"}
 MORE = {
     "study": ["study.runs.sweep.SweepTable", "study.notebook.Film"],
@@ -32,7 +35,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages = {"scene.md": scene_keys(scene_schema()), "references.md": (ROOT / "REFERENCES.md").read_text()}
     pages["api.md"] = python_names()
     pages["changes.md"] = (ROOT / "CHANGELOG.md").read_text()
-    for path in sorted((ROOT / "demos").glob("demo_*.py")):
+    for path in DEMOS:
         name = path.stem.removeprefix("demo_")
         book = jupytext.read(path)
         pages[f"tutorials/{name}.md"] = tutorial(name, book)
@@ -40,6 +43,23 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))
     return files
+
+
+def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Links to files of the checkout, which live in the raw pages, become links to the pages made of them."""
+    made = {
+        "REFERENCES.md": "references.md",
+        "CHANGELOG.md": "changes.md",
+        "demos/scenes/scene.schema.json": "scene.md",
+    }
+    made |= {f"demos/{path.name}": f"tutorials/{path.stem.removeprefix('demo_')}.md" for path in DEMOS}
+    folder = (ROOT / "docs" / page.file.src_uri).parent
+
+    def link(found: re.Match[str]) -> str:
+        target = os.path.relpath(folder / found[1], ROOT)
+        return f"]({os.path.relpath(ROOT / 'docs' / made[target], folder)}" if target in made else found[0]
+
+    return re.sub(r"\]\(([^)#:]+)", link, markdown)
 
 
 def python_names() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -16,7 +17,8 @@ from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from tests.hardcases import riccati as hard_riccati
 from tests.hardcases.cases import HardCase
-from tests.hardcases.riccati import exact_gain, problem_of, worst_part_error
+from tests.hardcases.gains import GainBounds, exact_gain, worst_part_error
+from tests.hardcases.riccati import gain_rows, problem_of
 
 pytestmark = pytest.mark.serial
 
@@ -72,6 +74,53 @@ def test_a_gain_that_leaves_the_tissue_out_fails(
     measured = [row for row in rows(True) if row.here.value is not None]
     assert measured
     assert [row.case for row in measured if row.ok] == []
+
+
+def shaken(share: float) -> Callable[..., RiccatiSolution]:
+    """A low-rank solver whose gain for the tissue is right to so many digits only."""
+
+    def solve(self: Any, problem: RiccatiProblem) -> RiccatiSolution:
+        answer = low_rank(self, problem)
+        K = answer.gain
+        return replace(answer, gain=replace(K, K_z=(1 + share) * K.K_z, K_v=(1 - share) * K.K_v))
+
+    low_rank = NewtonADI.solve
+    return solve
+
+
+def test_a_gain_that_loses_digits_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nine digits in the gain are too few at R = 1, where the residual of the answer warrants eleven."""
+    problem = problem_of()
+    monkeypatch.setattr(NewtonADI, "solve", shaken(1e-9))
+    (row,) = gain_rows("R = 1", 1.0, problem, solvers=("low rank",))
+    assert row.here.value == pytest.approx(1e-9, rel=0.01)  # the true error is a hundred times smaller
+    assert row.verdict == "fail"
+
+
+def test_a_factor_beyond_the_tolerance_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The gain is right, but the factor that comes with it solves the equation to 1e-6 only."""
+    low_rank = NewtonADI.solve
+
+    def solve(self: Any, problem: RiccatiProblem) -> RiccatiSolution:
+        answer = low_rank(self, problem)
+        return replace(answer, factor=answer.factor.times((1 + 1e-6) * np.eye(answer.rank)))
+
+    monkeypatch.setattr(NewtonADI, "solve", solve)
+    (row,) = gain_rows("R = 1", 1.0, problem_of(), solvers=("low rank",))
+    assert row.here.value == math.inf
+
+
+def test_first_order_moves_the_gain_as_the_equation_does() -> None:
+    """Another weight of the outputs is a residual of the old solution: both gains exact, the bound between them."""
+    problem = problem_of()
+    exact, share = exact_gain(problem), 1e-7
+    moved = exact_gain(replace(problem, Q=(1 + share) * problem.Q))
+    solution = DenseRiccati().solve(replace(problem, Q=(1 + share) * problem.Q))
+    bound, residual = GainBounds(problem, exact).of_factor(solution.factor)
+    assert residual == pytest.approx(share, rel=1e-4)  # of the rounding in Z
+    change = worst_part_error(moved, exact, problem.layout.n_s)
+    assert change < bound * (1 + 1e-6)  # of second order in the share
+    assert bound < 10 * change  # signs of the entries are all that it leaves out
 
 
 def test_error_of_a_gain_is_that_of_its_worst_part() -> None:
