@@ -75,17 +75,8 @@ def found(comm: MPI.Intracomm, *changes: dict[str, Any], **tables: Any) -> tuple
 
 def measured(model: Any) -> MeasuredScene:
     stepper = RepeatableRun(model)
-    case = MeasuredScene(
-        model,
-        {"step": [1.0]},
-        operator_hashes(model, stepper.run),
-        memory_by_object(model, stepper.run),
-        stepper.flops(),
-        {"step": [1.0]},
-        operator_hashes(model, stepper.run),
-        memory_by_object(model, stepper.run),
-        stepper.flops(),
-    )
+    held = memory_by_object(model, stepper.run)
+    case = MeasuredScene(model, {"step": [1.0]}, operator_hashes(model, stepper.run), held, stepper.flops())
     stepper.destroy()
     case.objects, case.objects_in_steps = objects_of(model.system.layout.comm, model.scene)
     return case
@@ -240,7 +231,7 @@ def test_rotation_shows_only_beside_the_reaction_that_is_advised(comm: MPI.Intra
 
 
 class Table(SwitchRuns):
-    """Experiments whose outputs are a formula of the effects that are on."""
+    """Runs whose outputs are a formula of the effects that are on."""
 
     def __init__(self, on: set[str], output: Callable[[Names], float], forced: Callable[[Names], float] | None) -> None:
         self.on, self.scales = frozenset(on), SCALES
