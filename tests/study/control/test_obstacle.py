@@ -93,9 +93,7 @@ def test_what_has_no_plan_is_refused_in_a_sentence(override: str, sentence: str,
 def test_a_scene_without_the_table_imports_no_plan(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from rich.console import Console;"
-        "from softgrasp.lqr.design.feedback import design
-from softgrasp.study.control.obstacle.measure import planned_study
-from softgrasp.study.control.run import run_control;"
+        "from softgrasp.study.control.run import run_control;"
         f"run_control(Path('paper_lqr'), Path(sys.argv[1]), {SMALL}, Console(quiet=True), quiet=True, pictures=False);"
         "sys.exit(any('constrained' in name or 'control.obstacle' in name for name in sys.modules))"
     )
