@@ -93,8 +93,10 @@ def steps_of(scene: Scene, n: int, dimension: int, ranks: int) -> Work:
     materials = [scene.tissue.material, *(layer.material for layer in scene.tissue.layers.values())]
     contrast = max(m.lam / m.mu for m in materials)
     time = scene.time
-    damped = scene.effects.damping is not None
-    return Work(n, dimension, scene.tissue.order, ranks, time.steps, False, contrast, time.reproducible, damped)
+    refine, damped = scene.tissue.refine, scene.effects.damping is not None
+    graded = refine is not None and refine.grading != "off"
+    order, bits = scene.tissue.order, time.reproducible
+    return Work(n, dimension, order, ranks, time.steps, False, contrast, bits, graded, damped)
 
 
 def free_bytes(scene: Scene) -> float:

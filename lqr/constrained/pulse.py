@@ -22,7 +22,7 @@ from softgrasp.lqr.plant.checks import ControlError
 FORGOTTEN = 1e-13  # of an amplitude: what older pulses leave is bounded by a geometric sum
 MOST_PULSES = 100_000  # memory of a tissue that hardly decays
 FINE = 128  # instants of an interval where the error is bounded; between them by its acceleration
-COARSE = 16  # instants where the acceleration is, a small part of the bound
+COARSE = 64  # instants where the acceleration is sampled, which is a few percent of the bound
 
 
 @dataclass(frozen=True)

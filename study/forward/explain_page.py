@@ -19,6 +19,10 @@ from softgrasp.study.report.tables import listed, percent
 from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Page, Session
 
+OPERATORS = (
+    "Operators are matrices and columns over the mesh. `softgrasp effects` adds up the memory of all that a run holds, "
+    "with vectors and small arrays."
+)
 FORECAST = ("ranks", "solver", "mesh, assembly", "set-up", "equilibrium", "steps", "fields", "in all", "memory")
 
 
@@ -61,7 +65,7 @@ def sections(result: Explanation) -> list[Section]:
         (f"{name}: {verdict(e)}", ". ".join(filter(None, (e.gate.comparison, e.gate.sentence))))
         for name, e in result.effects.items()
     ]
-    costs = [(name, f"It adds {e.term} and allocates {listed(e.operators)}. {e.cost}")
+    costs = [(name, f"It adds {e.term} and {_operators(e.operators)}. {e.cost}")
              for name, e in result.effects.items() if e.on]  # fmt: skip
     periods = [(k, w, T, t.dt / T) for k, (w, T) in enumerate(zip(t.omega, t.periods, strict=True), 1)]
     modes = ("mode", "omega [1/s]", "period [s]", "dt / period")
@@ -77,10 +81,14 @@ def sections(result: Explanation) -> list[Section]:
         Section("At rest under its weight, the hand held still", rows=sag_rows(result)),
         Section("Mesh", text="\n\n".join([*copied, *mesh_lines(result.mesh, result.dimension)])),
         Section("Effects", rows=effects),
-        *([Section("What is on", rows=costs)] if costs else []),
+        *([Section("What is on", OPERATORS, rows=costs)] if costs else []),
         Section("First modes of the clamped tissue", no_modes, header=modes if periods else (), rows=periods),
     ]
     return [replace(part, terminal=True) for part in parts]
+
+
+def _operators(names: Sequence[str]) -> str:
+    return f"the operator{'s' * (len(names) > 1)} {listed(names)}" if names else "no operator"
 
 
 def forecast_section(forecasts: Sequence[Forecast]) -> list[Section]:

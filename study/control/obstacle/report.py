@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem.columns import AXES
+from softgrasp.lqr.constrained.plan import Plan
 from softgrasp.study.control.obstacle.result import PlannedStudy
 from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table, listed
@@ -70,7 +71,7 @@ def facts(study: PlannedStudy) -> list[tuple[str, str]]:
     rows: list[tuple[str, Any]] = [
         ("reduced plant", f"N = {plant.N}, forces held for {plant.grid:g} s"),
         ("horizon", f"{plan.horizon.steps} intervals, {plan.followed} more followed until the rest is safe"),
-        ("quadratic program", f"{len(plan.c)} variables, {study.rows} rows, {len(plan.active)} of them hold the plan"),
+        ("quadratic program", f"{len(plan.c)} variables, {study.rows} rows, {_held(plan)}"),
     ]
     if task.shapes:
         rows += [
@@ -98,6 +99,11 @@ def facts(study: PlannedStudy) -> list[tuple[str, str]]:
         cold, warm = (1e3 * float(np.median(x)) for x in (study.seconds_cold, study.seconds_warm))
         rows.append(("time of the quadratic program", f"{cold:.2g} ms, from a plan nearby {warm:.2g} ms, in Python"))
     return rows
+
+
+def _held(plan: Plan) -> str:
+    """How many rows hold a plan, or that they are exceeded."""
+    return f"{len(plan.active)} of them hold the plan" if plan.depth == 0 else "no forces keep all of them"
 
 
 def words(sides: Sequence[int]) -> str:

@@ -186,10 +186,27 @@ def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | No
     return models
 
 
-def errors_at(full: FullRun, models: Sequence[TestedModel]) -> tuple[float, ...]:
-    """Deformation errors of all models at the parameter of one full run, without any new projection. Collective."""
+Family = tuple[str, bool]
+"""Key of a method, and whether several runs trained it."""
+
+
+def families(full: FullRun, models: Sequence[TestedModel]) -> dict[Family, ModelComparison]:
+    """What the errors of all models are computed from. Collective."""
     largest = {(m.method.key, m.several): m.model for m in sorted(models, key=lambda m: m.model.N)}
-    comparisons = {family: comparison_of(model, full) for family, model in largest.items()}
+    return {family: comparison_of(model, full) for family, model in largest.items()}
+
+
+def moved(known: dict[Family, ModelComparison], full: FullRun) -> dict[Family, ModelComparison]:
+    """The same at the materials of another run, of the same densities. Collective."""
+    system = full.model.system
+    places = {family: each.model.at(system.materials) for family, each in known.items()}
+    return {f: each.at(places[f], system, full.snapshots, full.energy) for f, each in known.items()}
+
+
+def errors_at(
+    full: FullRun, models: Sequence[TestedModel], comparisons: dict[Family, ModelComparison]
+) -> tuple[float, ...]:
+    """Deformation errors of all models at the parameter of one full run, without any new projection. Collective."""
     errors = []
     for m in models:
         with np.errstate(all="ignore"):  # may be unstable away from the training parameter
@@ -210,12 +227,14 @@ def measure_box(
     first, training, grid = scene.system.materials[0], training_of(scene), grid_of(scene)
     models = box_models(full, sweeps, training_states(full, training) if training else None)
     trained_at = ((first.lam, first.mu), *training)
-    points = []
+    known = families(full, models)
+    own, points = errors_at(full, models, known), []
     for k, (lam, mu) in enumerate(grid):
         progress(k, len(grid))
         trained = any(np.allclose((lam, mu), place) for place in trained_at)
-        points.append(BoxPoint(lam, mu, trained, errors_at(run_at(scene, lam, mu), models)))
-    own, tests, summary = errors_at(full, models), [p for p in points if not p.trained] or points, []
+        place = run_at(scene, lam, mu)
+        points.append(BoxPoint(lam, mu, trained, errors_at(place, models, moved(known, place))))
+    tests, summary = [p for p in points if not p.trained] or points, []
     for i, m in enumerate(models):
         errors = [p.errors[i] for p in tests]
         runs = len(trained_at) if m.several else int(m.method.snapshots)

@@ -77,3 +77,12 @@ def test_a_repeated_factor_costs_what_it_costs_on_one_rank() -> None:
     assert both[0].memory("mumps") == 2 * alone.memory("mumps")
     assert both[1].seconds("mumps") < 0.7 * alone.seconds("mumps")
     assert both[1].memory("mumps") == alone.memory("mumps")
+    assert "time.reproducible = false" in both[0].price_of_bits("mumps")
+    assert not both[1].price_of_bits("mumps")
+    assert not alone.price_of_bits("mumps")
+
+
+def test_graded_lines_go_to_a_factor() -> None:
+    """P1 on 1.3e5 unknowns of crowding lines: cg was chosen and took 216 s of the processor for 40 steps, MUMPS 50."""
+    work = Work(127_725, 3, 1, 1, 40, False, SILICONE, graded=True, damped=True)
+    assert work.choose()[0] == "mumps"

@@ -13,6 +13,7 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.solve.solvers import make_solver
 from softgrasp.fem.solve.stars import star_inverses
+from softgrasp.fem.solve.statics import equilibrium
 from softgrasp.fem.system import dynamic_stiffness
 from tests.helpers.models import CUBE, close, gather_matrix, gather_rows, local_rows, make_scene
 
@@ -149,6 +150,15 @@ def test_layers_do_not_raise_the_iterations() -> None:
     box = "[[0.01, 0.01, 0.01], [0.04, 0.04, 0.05]]"
     layer = f"tissue.layers.core={{box={box}, material={{young=6.9e6, poisson=0.3, rho=1000.0}}}}"
     assert iterations(build("block_3d", [*silicone([4, 3, 8]), layer]), 400.0) <= 33  # measured 26, uniform 24
+
+
+@pytest.mark.serial
+def test_static_solves_are_accepted_to_rounding() -> None:
+    """A slender block: rounding leaves 3e-11 of the load whatever the iteration, and 1e-11 was asked of it."""
+    slender = ["tissue.size=[0.05, 0.05, 1.0]", "contact.box=[[0.0, 0.0, 0.9], [0.05, 0.05, 1.0]]"]
+    system = build("block_3d", [*silicone([2, 2, 40]), *slender, "control.outputs=[{kind='hand', name='hand'}]"]).system
+    by_stars, by_factor = (equilibrium(system, solver) for solver in ("stars", "mumps"))
+    assert close(by_stars, by_factor) < 1e-8  # residual times the condition of a beam of 20 widths
 
 
 @pytest.mark.slow

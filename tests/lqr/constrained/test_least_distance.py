@@ -4,17 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.optimize
 
 from softgrasp.lqr.constrained.least_distance import InfeasibleError, nearest, nearest_soft
-
-
-def oracle(G: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Lawson and Hanson: E u - e_{n+1} of the best u >= 0 is (x, -1) to scale, E = [-G'; -h']."""
-    E = -np.vstack([G.T, h])
-    u, _ = scipy.optimize.nnls(E, np.eye(len(E))[-1], maxiter=100_000)
-    left = E @ u - np.eye(len(E))[-1]
-    return -left[:-1] / left[-1]
+from tests.helpers.least_distance import least_squares
 
 
 def rows(rng: np.random.Generator, m: int, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -30,7 +22,7 @@ def test_equal_to_least_squares(m: int, n: int) -> None:
         G, h = rows(rng, m, n)
         found = nearest(G, h)
         # rounding of the two methods; the oracle divides by its residual
-        assert np.abs(found.x - oracle(G, h)).max() < 1e-11
+        assert np.abs(found.x - least_squares(G, h)).max() < 1e-11
         assert (G @ found.x - h).max() < 1e-12
         assert np.abs(found.x + G.T @ found.multipliers).max() < 1e-11
         assert (found.multipliers >= 0).all()

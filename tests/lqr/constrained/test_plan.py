@@ -14,7 +14,8 @@ from softgrasp.fem.obstacles.shapes import Ball, HalfSpace, Shape
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.constrained import plan as planning
 from softgrasp.lqr.constrained.horizon import HeldPlant, held_plant
-from softgrasp.lqr.constrained.plan import Plan, Task, make_plan
+from softgrasp.lqr.constrained.least_distance import nearest
+from softgrasp.lqr.constrained.plan import Plan, Task, make_plan, quadratic_program
 from softgrasp.lqr.constrained.pulse import PulseError
 from softgrasp.lqr.constrained.rows import Limits
 from softgrasp.lqr.constrained.run import PlanRuns, plan_inputs, run_plan
@@ -24,6 +25,7 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import hand_target, rest
 from softgrasp.lqr.riccati import solve
+from tests.helpers.least_distance import least_squares
 
 WALL = HalfSpace(np.array([-1.0, 0.0]), -6.05)  # 5 cm behind the target of the right edge
 DISC = Ball(np.array([3.4, 1.2]), 0.7)  # on the way
@@ -107,6 +109,16 @@ def test_plan_of_a_small_plant_is_the_same_on_all_ranks() -> None:
     assert abs(plan.c @ plan.c - 6.563183) < 1e-4
     for value in (plan.cost, *runs.planned.least):
         assert MPI.COMM_WORLD.allreduce(value, MPI.MAX) == value
+
+
+def test_program_of_a_plan_is_solved_as_by_least_squares() -> None:
+    plant, given = task(14, WALL, DISC, cells="[4, 8]")
+    plan = make_plan(plant, given, 30)
+    G, h = quadratic_program(plan)
+    found = nearest(G, h, plan.active)
+    near = np.argsort(h - G @ found.x)[:985]  # the oracle is slow for all 13 000 rows; the others are kept
+    assert (G @ found.x - h).max() < 1e-12  # rounding of rows of size one
+    assert np.abs(found.x - least_squares(G[near], h[near])).max() < 1e-11  # the oracle divides by its residual
 
 
 def test_start_inside_an_obstacle_is_a_result() -> None:

@@ -12,7 +12,7 @@ from tests.helpers.random_scenes import run_random
 pytestmark = pytest.mark.serial
 FIRST = 100_000
 COUNT = int(os.environ.get("RANDOM_SCENES", "3000"))  # of the slow test
-AT_ONCE = 100  # scenes of one test, which may take five minutes
+AT_ONCE = 50  # scenes of one test, which may take five minutes
 
 
 def defects(seeds: range, folder: Path) -> list[str]:
