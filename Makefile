@@ -54,6 +54,7 @@ paper: $(STAMP) ## every figure and table of the paper, and a page that compares
 
 pictures: demo ## make the README's pictures again
 	cp out/paper_forward-simulate/move.png docs/paper_forward.png
+	cp out/paper_forward-simulate/move.gif docs/move.gif
 	$(BIN)/softgrasp view out/paper_forward-simulate --save docs/view.png
 	$(BIN)/softgrasp reduce paper_forward
 	cp out/paper_forward-reduce/errors.png docs/reduce_errors.png

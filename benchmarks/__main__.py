@@ -1,4 +1,4 @@
-"""``python -m benchmarks forward | riccati | meshes | accuracy | certified | solvers``."""
+"""``python -m benchmarks forward | riccati | meshes | accuracy | certified | outputs | figures | solvers | scale``."""
 
 from __future__ import annotations
 
@@ -11,15 +11,27 @@ from typing import Any
 import typer
 from mpi4py import MPI
 
-from benchmarks import accuracy, certified, forward, forward_rows, meshes, riccati, solvers
+from benchmarks import (
+    accuracy,
+    certified,
+    figures,
+    forward,
+    forward_rows,
+    meshes,
+    outputs,
+    riccati,
+    scale,
+    scale_rows,
+    solvers,
+)
 from softgrasp.study.shell.ending import run_command
 
 COMMANDS = {
     "forward": forward, "riccati": riccati, "meshes": meshes, "accuracy": accuracy, "certified": certified,
-    "solvers": solvers,
+    "outputs": outputs, "figures": figures, "solvers": solvers, "scale": scale,
 }  # fmt: skip
 WORKERS: dict[str, Callable[..., Iterable[Any]]] = {
-    "forward": forward_rows.measure_row, "riccati": riccati.measure_row,
+    "forward": forward_rows.measure_row, "riccati": riccati.measure_row, "scale": scale_rows.measure_row,
 }  # fmt: skip
 
 app = typer.Typer(

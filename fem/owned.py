@@ -67,6 +67,7 @@ class _Held:
 
 
 _held: _Held | None = None
+_outer: list[_Held] = []  # folders of the commands inside which the running one was called
 
 
 def hold(folder: Path) -> None:
@@ -79,6 +80,9 @@ def hold(folder: Path) -> None:
     if _held is not None and _held.folder == home and _held.locked:
         return
     release()
+    if (shared := next((outer for outer in _outer if outer.folder == home and outer.locked), None)) is not None:
+        _held = shared
+        return
     made = not home.exists()
     home.mkdir(parents=True, exist_ok=True)
     lock, me = home / LOCK, Process.own()
@@ -144,7 +148,7 @@ def release() -> None:
     """Unlock the folder; remove the list of a run that wrote nothing, and a folder that was made for it."""
     global _held
     held, _held = _held, None
-    if held is None or not held.locked or held.pid != os.getpid():
+    if held is None or not held.locked or held.pid != os.getpid() or held in _outer:
         return
     with suppress(OSError):  # gone with the folder
         (held.folder / LOCK).unlink()
@@ -158,6 +162,22 @@ atexit.register(release)
 
 
 @contextmanager
+def set_aside() -> Iterator[None]:
+    """A block, such as a command, with a folder of its own; at its end the one before is held again."""
+    global _held
+    outer, _held = _held, None
+    if outer is not None:
+        _outer.append(outer)
+    try:
+        yield
+    finally:
+        release()
+        if outer is not None:
+            _outer.pop()
+        _held = outer
+
+
+@contextmanager
 def locked(comm: MPI.Intracomm, folder: Path) -> Iterator[None]:
     """Lock a folder during a block, unless the running command has locked it or one above it. Collective.
 
@@ -166,13 +186,11 @@ def locked(comm: MPI.Intracomm, folder: Path) -> Iterator[None]:
     if _held is not None and folder.resolve().is_relative_to(_held.folder):
         yield
         return
-    with raise_on_all_ranks(comm):
-        if comm.rank == 0:
-            hold(folder)
-    try:
+    with set_aside():
+        with raise_on_all_ranks(comm):
+            if comm.rank == 0:
+                hold(folder)
         yield
-    finally:
-        release()
 
 
 def begin_list(command: str, scene: str) -> None:

@@ -188,3 +188,15 @@ def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:
         raise failure
     value: R = result
     return value
+
+
+def to_ranks(comm: MPI.Intracomm, rank: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Send each of these rows (k, ...) to a rank, and return those that come here. Collective."""
+    width = int(np.prod(rows.shape[1:]))
+    counts = width * np.bincount(rank, minlength=comm.size).astype(np.int64)
+    coming = np.empty_like(counts)
+    comm.Alltoall(counts, coming)
+    found = np.empty((int(coming.sum()) // width, *rows.shape[1:]), dtype=np.int64)
+    sent = np.ascontiguousarray(rows[np.argsort(rank, kind="stable")])
+    comm.Alltoallv([sent, counts], [found, coming])
+    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import shutil
 from collections.abc import Sequence
@@ -64,6 +65,15 @@ def check_room(comm: MPI.Intracomm, files: Sequence[Path], needed: int, reserve:
                 f"{files[0]} needs {needed + MARGIN} bytes more and no file may pass {limit} bytes here; raise the "
                 "limit (ulimit -f)"
             )
+
+
+def reserve_room(path: Path, size: int) -> None:
+    """Take room on the disk behind the end of a file: HDF5, which gives back the rest, ends the program without it.
+
+    Raises OSError: there is none, or the user's quota or the limit of a file's size is reached.
+    """
+    with path.open("r+b") as file:
+        os.posix_fallocate(file.fileno(), file.seek(0, os.SEEK_END), size)
 
 
 def _largest(path: Path) -> int:

@@ -15,11 +15,12 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.errors import no_pipe, raise_on_all_ranks
+from softgrasp.fem.errors import ResourceError, no_pipe, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.resources import MARGIN, reserve_room
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.operators import Reconstruction
 from softgrasp.reduction.system import ModelError, Outputs
@@ -69,7 +70,8 @@ def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
     Folders are created.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: the folder cannot be made, or nothing may be written there.
+        ResourceError: the disk is full; what was there before stays.
     """
     if isinstance(model, ReducedModel):
         kind, reconstruction = LINEAR, model.reconstruction
@@ -179,7 +181,9 @@ def write_model(
 ) -> None:
     """Write a file of kind :data:`LINEAR` or :data:`STRAIN` beside its place and move it there whole.
 
-    Collective with a reconstruction, whose rows every rank adds in turn; ``small`` writes the arrays. Raises OSError.
+    Collective with a reconstruction, whose rows every rank adds in turn; ``small`` writes the arrays.
+
+    Raises OSError, ResourceError: as :func:`save`.
     """
     comm = MPI.COMM_SELF if reconstruction is None else reconstruction.layout.comm
     unfinished = path.with_name(path.name + ".part")
@@ -188,9 +192,14 @@ def write_model(
             if comm.rank == 0:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 note(unfinished, path)
-                with h5py.File(unfinished, "w") as file:
+                # written by Python: HDF5 ends the program on a full disk
+                with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
                     file.attrs["format"], file.attrs["model"] = kind, json.dumps(about)
                     small(file)
+                    file.flush()
+                    image = file.id.get_file_image()
+                with _named(path):
+                    unfinished.write_bytes(image)
         for rank in range(comm.size):
             # one file, one writer at a time: the file library here is not a parallel one
             with raise_on_all_ranks(comm):
@@ -198,12 +207,23 @@ def write_model(
                     _write_rows(reconstruction, unfinished)
         with raise_on_all_ranks(comm):
             if comm.rank == 0:
+                with _named(path):
+                    reserve_room(unfinished, MARGIN)
                 with h5py.File(unfinished, "r+") as file:
                     write_checksums(file)
                 unfinished.replace(path)
     finally:  # of a file that was not written whole
         if comm.rank == 0:
             unfinished.unlink(missing_ok=True)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Raises ResourceError in place of an OSError, with the name of the file."""
+    try:
+        yield
+    except OSError as error:
+        raise ResourceError(f"{path} cannot be written ({error.strerror or error}); free the disk") from error
 
 
 @contextmanager
@@ -271,6 +291,9 @@ def _digest(file: h5py.File, reconstruction: bool) -> str:
 def _write_rows(reconstruction: Reconstruction, path: Path) -> None:
     layout, d = reconstruction.layout, reconstruction.layout.dimension
     parts = {"nodes": layout.nodes, "L_q": reconstruction.L_q, "L_v": reconstruction.L_v, "W_G": reconstruction.W_G}
+    size = sum(part.nbytes // max(len(part), 1) for part in parts.values() if part is not None)
+    with _named(path.with_suffix("")):  # the first rank makes the datasets whole
+        reserve_room(path, MARGIN + (size * layout.n_e if layout.start == 0 else 0))
     with h5py.File(path, "r+") as file:
         for key, part in parts.items():
             if part is None:

@@ -129,14 +129,18 @@ class Span:
 
 
 def span_of(view: View, V: Array, system: BlockSystem, snapshots: Snapshots) -> Span:
-    """Factor the columns V of a view and put the snapshots into them, some columns at a time. Collective.
+    """Factor the columns V of a view and put the snapshots into them. Collective.
 
     Raises:
         BasisError: V is zero or not finite.
         SolverError: the factorisation fails.
     """
+    return span_in(view, factor(system.layout.comm, V).Q, system, snapshots)
+
+
+def span_in(view: View, Q: Array, system: BlockSystem, snapshots: Snapshots) -> Span:
+    """Snapshots in orthonormal columns Q of a view, local rows, some at a time. Collective."""
     comm, n = system.layout.comm, system.layout.n_local
-    Q = factor(comm, V).Q
     C, sums = [], np.zeros(2)
     for b in column_blocks(snapshots.Z.shape[1]):
         Z = snapshots.Z[:, b]
@@ -159,6 +163,8 @@ class ModelComparison:
     snapshots: Snapshots  # of the full run
     energy: Array  # :func:`full_energy` of the snapshots
     _spans: dict[View, Span] = field(default_factory=dict, repr=False)
+    # what the last model asked about shows, in the span of each view
+    _shown: dict[View, tuple[ReducedModel, Array]] = field(default_factory=dict, repr=False)
 
     def span(self, view: View) -> Span:
         """Snapshots in what the largest model shows; factored at the first call. Collective.
@@ -170,6 +176,22 @@ class ModelComparison:
             self._spans[view] = span_of(view, V, self.system, self.snapshots)
         return self._spans[view]
 
+    def at(self, small: EnergySystem, system: BlockSystem, snapshots: Snapshots, energy: Array) -> ModelComparison:
+        """The same family against a run that differs in stiffness alone: the spans of its models stay. Collective."""
+        spans = {view: span_in(view, span.Q, system, snapshots) for view, span in self._spans.items()}
+        return ModelComparison(self.model, small, system, snapshots, energy, spans)
+
+    def shown(self, view: View, model: ReducedModel, small: EnergySystem) -> Array:
+        """R of :meth:`Span.inside` for what a model shows, kept until another is asked for. Collective.
+
+        Raises ModelError: the model shows more than the largest.
+        """
+        known, R = self._shown.get(view, (None, np.zeros((0, 0))))
+        if known is not model:
+            R = self.span(view).inside(shown_rows(view, model, small, self.system))
+            self._shown[view] = model, R
+        return R
+
     def state_error(self, view: View, model: ReducedModel, small: EnergySystem, run: ReducedTrajectory) -> float:
         """|X - X_r|_F / |X|_F of a run on the full model's time grid, of the largest model or a smaller. Collective.
 
@@ -178,9 +200,8 @@ class ModelComparison:
         steps = self.snapshots.steps
         if len(run.x) <= int(steps.max(initial=0)):
             raise ModelError(f"the reduced run has {len(run.x) - 1} steps, the snapshots reach step {int(steps.max())}")
-        span = self.span(view)
         Y = np.vstack([run.x[steps].T, run.q_s[steps].T, run.v_s[steps].T])
-        return span.error(span.inside(shown_rows(view, model, small, self.system)), Y)
+        return self.span(view).error(self.shown(view, model, small), Y)
 
     def errors(self, model: ReducedModel, small: EnergySystem, run: ReducedTrajectory) -> ModelErrors:
         """All errors of a run; see :meth:`state_error`. Collective."""
@@ -194,9 +215,7 @@ class ModelComparison:
 
         Raises ModelError: the model shows more than the largest.
         """
-        span = self.span(view)
-        R = span.inside(shown_rows(view, model, small, self.system))
-        return span.projection_error(R @ with_hand(small))
+        return self.span(view).projection_error(self.shown(view, model, small) @ with_hand(small))
 
 
 def with_hand(small: EnergySystem) -> Array:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import TYPE_CHECKING, overload
 
+from softgrasp.fem.errors import shortened
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.reduction.bases.basis import Basis, ReductionError
 from softgrasp.reduction.bases.engines import EngineName
 from softgrasp.reduction.bases.inner import InnerName
 from softgrasp.reduction.bases.registry import make_basis
-from softgrasp.reduction.bases.states import States
+from softgrasp.reduction.bases.states import BasisError, States
 from softgrasp.reduction.bases.truncation import Truncation
 from softgrasp.reduction.errors import ModelErrors
 from softgrasp.reduction.model import ReducedModel
@@ -76,16 +78,20 @@ def reduce(
         ReductionError: a model at finite strain with a linear one's options, or no weights reach their tolerance.
         SolverError: a factorisation failed, or a reduced run did not converge.
     """
+    if not (N is None or isinstance(N, Truncation | Integral)) or isinstance(N, bool):
+        raise BasisError(f"N = {shortened(repr(N))} is no dimension; give a whole number, a Truncation or None")
+    if not isinstance(runs, Trajectory | FullRun | Sequence):
+        raise ReductionError(f"{shortened(repr(runs))} is no run; give what softgrasp.simulate returns, or a list")
     fulls = [as_full(model, run) for run in ([runs] if isinstance(runs, Trajectory | FullRun) else runs)]
     if model.system.points is None:
         return reduce_linear(model, fulls, method or "psd_fixed", N, inner, engine)
     from softgrasp.reduction.strain.training import train
 
-    if method is not None or inner is not None or engine != "tsqr" or not isinstance(N, int):
+    if method is not None or inner is not None or engine != "tsqr" or not isinstance(N, Integral):
         raise ReductionError(
             f"scene {model.scene.name} has effects.finite_strain, whose models have one basis; give N alone"
         )
-    return train(model, fulls, N).reduce(N)
+    return train(model, fulls, int(N)).reduce(int(N))
 
 
 @overload

@@ -21,6 +21,7 @@ from softgrasp.fem.scene.scene import scene_schema
 
 ROOT = Path(__file__).parents[1]
 DEMOS = sorted((ROOT / "demos").glob("demo_*.py"))
+OWN_BASIS = "static_responses.py"
 ROOMS = {"fem": "Scene, model, run", "reduction": "Reduced models", "lqr": "Control", "study": "Many runs"}
 MORE = {
     "study": ["study.runs.sweep.SweepTable", "study.notebook.Film"],
@@ -35,6 +36,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages = {"scene.md": scene_keys(scene_schema()), "references.md": (ROOT / "REFERENCES.md").read_text()}
     pages["api.md"] = python_names()
     pages["changes.md"] = (ROOT / "CHANGELOG.md").read_text()
+    pages[OWN_BASIS] = (ROOT / "demos" / OWN_BASIS).read_text()
     for path in DEMOS:
         name = path.stem.removeprefix("demo_")
         book = jupytext.read(path)
@@ -51,6 +53,7 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
         "REFERENCES.md": "references.md",
         "CHANGELOG.md": "changes.md",
         "demos/scenes/scene.schema.json": "scene.md",
+        f"demos/{OWN_BASIS}": OWN_BASIS,
     }
     made |= {f"demos/{path.name}": f"tutorials/{path.stem.removeprefix('demo_')}.md" for path in DEMOS}
     folder = (ROOT / "docs" / page.file.src_uri).parent

@@ -99,6 +99,11 @@ def build(
         model, passes, mesh = build_on(scene, comm=comm, mesh=mesh), passes + 1, None
 
 
+def adapted_mesh(model: Model) -> TissueMesh | None:
+    """The mesh that the tolerance of a scene led to, for variants of the scene; None where each makes its own."""
+    return None if model.accuracy is None else model.space.mesh
+
+
 def _effectivity(old: Array, error: Array, new: Array) -> float:
     """Estimate over error, e, from the estimates on two meshes, within what has been seen.
 

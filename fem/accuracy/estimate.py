@@ -68,7 +68,7 @@ def estimate(
         coarse: its small model, if there is one.
         finer: that of :func:`next_order`, likewise, for scenes with ``tissue.refine``.
         surplus: correct the next order by some iterations instead of solving there, for scenes with ``tissue.refine``.
-        cells: of a coarser box, whose error is taken for that of the model.
+        cells: of a coarser box, whose error is extrapolated to the model's.
 
     Raises:
         SolverError: a static solve fails.
@@ -79,9 +79,7 @@ def estimate(
         tissue = model.scene.tissue.model_copy(update={"cells": cells})
         result = estimate(like(model, model.scene.model_copy(update={"tissue": tissue})))
         seconds = model.system.layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX)
-        none = np.zeros_like(result.delta)
-        own = {"shift": zone_shift(model), "n_e": model.system.layout.n_e, "seconds": seconds}
-        return replace(result, by="coarser", delta=none, **own)
+        return replace(extrapolated(result, model), seconds=seconds)
     small = coarse or krylov_model(model)
     run = small.run
     if model.scene.tissue.refine is not None:
@@ -109,6 +107,27 @@ def estimate(
         by=by,
         offer=offer,
         seconds=model.system.layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX),
+    )
+
+
+def extrapolated(result: MeshEstimate, model: Model) -> MeshEstimate:
+    """The estimate of a box from that of the same box on coarser cells. Collective.
+
+    On lines that crowd at singular ends errors fall with the order of the elements, on even cells with order 1, in
+    n_e^(1/d). So the estimate is 0.6 to 1.8 of that on the cells themselves, see the tests; the bound allows twice.
+    """
+    layout, tissue = model.system.layout, model.scene.tissue
+    graded = tissue.refine is not None and tissue.refine.grading != "off"
+    share = (result.n_e / layout.n_e) ** ((tissue.order if graded else 1) / layout.dimension)
+    return replace(
+        result,
+        estimate=share * result.estimate,
+        bound=min(2 * share, 1.0) * result.bound,
+        delta=np.zeros_like(result.delta),
+        omega=tuple(share * x for x in result.omega),
+        shift=zone_shift(model),
+        n_e=layout.n_e,
+        by="coarser",
     )
 
 

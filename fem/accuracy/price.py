@@ -14,46 +14,23 @@ from softgrasp.fem.accuracy.estimate import MOST_COMPARED, next_unknowns
 from softgrasp.fem.accuracy.krylov import BLOCKS
 from softgrasp.fem.accuracy.surplus import ITERATIONS, MODES
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.solve.solvers import ITERATIVE, choose_solver
+from softgrasp.fem.run.forecast import forecast
+from softgrasp.fem.solve.costs import BUILD, ENTRIES, Work
 
 SHARE = 0.3  # of a run's work that an estimate may take unasked
-START = 3.0  # [s] of every command: imports, page and pictures of a small run
-# By dimension and order: seconds to build a cell, and entries of K an unknown.
-BUILD = {(2, 1): 6e-6, (2, 2): 2.5e-5, (2, 3): 5.4e-5, (2, 4): 2e-4,
-         (3, 1): 9e-6, (3, 2): 9e-5, (3, 3): 6.7e-4, (3, 4): 3.5e-3}  # fmt: skip
-ENTRIES = {(2, 1): 14, (2, 2): 23, (2, 3): 34, (2, 4): 46, (3, 1): 40, (3, 2): 77, (3, 3): 123, (3, 4): 198}
-PER_ENTRY = 1e-9  # [s] of an entry in a product
 PRODUCTS = 4  # with a column of a Krylov model, for its inner products
 STARS = {2: 3e-5, 3: 1.2e-4, 4: 4e-4}  # [s] an unknown to set up stars, by order
 STARS_ENTRY = 6.5e-9  # [s] of an entry in an iteration with them
-STEP_ITERATIONS = 7  # of a step with them, or of cg with another preconditioner that takes as long
 MOST_STARS = 1_200_000  # unknowns whose stars fit into the memory of a node
 COARSER = (0.8, 2 / 3, 0.5)  # cells a side of a box that is estimated instead, over those of the mesh
 GRADED = {2: 0.3, 3: 0.9}  # [s] of graded meshes to compare with
 GRADED_FILE = {2: 0.3, 3: 3.5}  # the same of a mesh file, whose edges are bisected
 
 
-def factor_seconds(d: int, n: float) -> float:
-    """Of a Cholesky factor of n unknowns."""
-    return 3.5e-8 * n**1.5 if d == 2 else 1.3e-9 * n**2
-
-
-def solve_seconds(d: int, n: float) -> float:
-    """Of one solve with it."""
-    return 1.2e-8 * n * math.log2(max(n, 2)) if d == 2 else 3.5e-8 * n ** (4 / 3)
-
-
 def run_seconds(model: Model) -> float:
-    """Of the run of a scene: its start, building, factors and steps."""
-    layout, scene = model.system.layout, model.scene
-    d, n, kind = layout.dimension, layout.n_e, _kind(model)
-    entries = ENTRIES[kind] * n
-    if choose_solver(layout, scene.time.solver)[0] in ITERATIVE:
-        factor, step = 0.0, STEP_ITERATIONS * STARS_ENTRY * entries
-    else:
-        factor, step = factor_seconds(d, n), solve_seconds(d, n) + PRODUCTS * PER_ENTRY * entries
-    factors = 2 if scene.time.start == "equilibrium" else 1
-    return START + BUILD[kind] * _cells(model) + factors * factor + scene.time.steps * step
+    """Of the run of a scene on one rank, whatever memory is free: the same everywhere."""
+    layout = model.system.layout
+    return forecast(model.scene, layout.n_e, layout.dimension, _cells(model), 1).seconds
 
 
 @dataclass(frozen=True)
@@ -109,8 +86,8 @@ def _estimate_seconds(model: Model, share: float = 1.0) -> float:
 
 def _krylov(model: Model, d: int, p: int, n: float) -> float:
     """Of a Krylov model of n unknowns: a factor, and some solves and products of each column."""
-    column = solve_seconds(d, n) + PRODUCTS * PER_ENTRY * ENTRIES[d, p] * n
-    return factor_seconds(d, n) + BLOCKS * _columns(model) * column
+    work = Work(int(n), d, p, 1, BLOCKS * _columns(model), True, model.system.contrast)
+    return work.seconds(work.solver()) + work.solves * PRODUCTS * work.product(ENTRIES[d, p])
 
 
 def _columns(model: Model) -> int:

@@ -57,6 +57,13 @@ class Discretisation:
         result.x.scatter_forward()
         return result
 
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which of the owned free nodes and which of the held ones lie on the boundary of the body. Collective."""
+        mesh = self.mesh.mesh
+        mesh.topology.create_connectivity(self.mesh.dimension - 1, self.mesh.dimension)
+        on, _ = contact_blocks(self.V, dolfinx.mesh.exterior_facet_indices(mesh.topology))
+        return np.isin(self.free, on), np.isin(self.contact, on)
+
     def gradients(self, at: Array) -> Array:
         """Gradients of the shape functions at points (q, d) of the reference cell, (owned cells, q, nodes, d) [1/m]."""
         table = self.V.element.basix_element.tabulate(1, at)[1:, :, :, 0]  # (d, q, nodes)

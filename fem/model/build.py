@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from mpi4py import MPI
 from softgrasp.fem.effects.damping import operator as damping_operator
 from softgrasp.fem.effects.gravity import acceleration
 from softgrasp.fem.effects.rotation import hand_mass
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem.errors import SceneError, shortened
 from softgrasp.fem.material import LayerMaterial, in_words
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.mesh.scene_hash import scene_hash, scene_keys
@@ -48,7 +49,7 @@ class MeshEstimate:
     n_e: int  # tissue unknowns of the mesh that was estimated [1]
     finer: int  # tissue unknowns of the mesh that it was compared with [1]
     # finer mesh: "order", the next order on the same cells, or "graded", another mesh, which meets the zone; "coarser":
-    # the error is that of a mesh of fewer cells, about as large or larger
+    # the error is extrapolated from a mesh of fewer cells
     by: str
     tolerance: float | None = None  # tolerance of the scene [1], or None
     passes: int = 0  # number of refinements after the first estimate [1]
@@ -172,8 +173,12 @@ class Model(Shown):
             rho: density [kg/m^3]; None keeps that of each layer.
             young, poisson: Young's modulus [Pa] and Poisson's ratio [1], together, instead of lam and mu.
 
-        Raises SceneError: a number is not positive (lam: not above -2 mu / d), or not finite.
+        Raises SceneError: a value is no number, not positive (lam: not above -2 mu / d), or not finite.
         """
+        given = {"lam": lam, "mu": mu, "rho": rho, "young": young, "poisson": poisson}
+        for key, value in given.items():
+            if value is not None and not isinstance(value, Real):
+                raise SceneError(f"{key} = {shortened(repr(value))} must be a number")
         if young is not None or poisson is not None:
             if young is None or poisson is None or lam is not None or mu is not None:
                 raise SceneError("young and poisson go together, without lam and mu; give one pair")

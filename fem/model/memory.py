@@ -12,7 +12,7 @@ from softgrasp.fem.errors import ResourceError, shortened
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.resources import free_memory
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.solve.solvers import ITERATIVE, SolverName, choose_solver, factor_on_every_rank
+from softgrasp.fem.solve.costs import ITERATIVE, SolverName, Work
 
 # Peak of mesh, forms and matrices, those of a step included [byte a cell], by dimension and order, measured on boxes
 # of 5e4 to 7e5 simplices; then what each layer adds. With the factor they give 0.8 to 1.04 of what was measured. Order
@@ -57,14 +57,17 @@ def box_simplices(cells: list[int]) -> int:
     return math.factorial(len(cells)) * math.prod(cells)
 
 
-def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: bool) -> Need:
-    """Estimate the memory of a model of ``cells`` triangles or tetrahedra and, if it will ``run``, of its steps."""
+def need(scene: Scene, dimension: int, cells: int, ranks: int, free: float, run: bool) -> Need:
+    """Estimate the memory of a model of ``cells`` triangles or tetrahedra and, if it will ``run``, of its steps.
+
+    ``free``: memory that the solver may take over all ranks [byte].
+    """
     kind, d = (dimension, scene.tissue.order), dimension
     n_e = max(int(kind[1] ** d / math.factorial(d) * cells * d), 1)  # p^d / d! nodes a cell in large regular meshes
     n_s = d + (d * (d - 1) // 2 if scene.effects.rotation else 0)
-    layout = BlockLayout(comm, d, n_s, n_e, 0, 0, np.zeros((0, d)), np.zeros(d), kind[1])
-    name, _ = solver_of(scene, layout)
-    copies = comm.size if factor_on_every_rank(layout, name, scene.time.reproducible) else 1
+    work = steps_of(scene, n_e, d, ranks)
+    name = work.solver(scene.time.solver, free)
+    copies = ranks if work.repeated(name) else 1
     outputs = sum(n_s if o.kind == "hand" else d for o in scene.control.outputs) if scene.control is not None else d
     # times; q, v, a, c, pulls and temporaries of the hand's table; outputs, their sum and their rigid share: measured
     # 194 byte a step for n_s = d = 2
@@ -78,11 +81,22 @@ def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: boo
 
 
 def solver_of(scene: Scene, layout: BlockLayout) -> tuple[SolverName, str]:
-    """The solver of the steps of a scene, with the reason in words, see `choose_solver`. Collective."""
+    """The solver of the steps of a scene, with the reason in words. Collective."""
+    free = layout.comm.allreduce(free_bytes(scene), MPI.MIN)
+    work = steps_of(scene, layout.n_e, layout.dimension, layout.comm.size)
+    name = work.solver(scene.time.solver, free)
+    return name, work.reason(scene.time.solver, free) + work.price_of_bits(name)
+
+
+def steps_of(scene: Scene, n: int, dimension: int, ranks: int) -> Work:
+    """The solves of the steps of a scene with n unknowns."""
     materials = [scene.tissue.material, *(layer.material for layer in scene.tissue.layers.values())]
     contrast = max(m.lam / m.mu for m in materials)
-    free = layout.comm.allreduce(free_bytes(scene), MPI.MIN)
-    return choose_solver(layout, scene.time.solver, False, contrast, scene.time.steps, free)
+    time = scene.time
+    refine, damped = scene.tissue.refine, scene.effects.damping is not None
+    graded = refine is not None and refine.grading != "off"
+    order, bits = scene.tissue.order, time.reproducible
+    return Work(n, dimension, order, ranks, time.steps, False, contrast, bits, graded, damped)
 
 
 def free_bytes(scene: Scene) -> float:
@@ -98,7 +112,8 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
     node = comm.Split_type(MPI.COMM_TYPE_SHARED)
     ranks, free = node.size, node.bcast(free_bytes(scene))
     node.Free()
-    estimate = need(scene, dimension, cells, comm, run)
+    least = comm.allreduce(free, MPI.MIN)
+    estimate = need(scene, dimension, cells, comm.size, least, run)
     nodes = comm.allgather((estimate.of(ranks / comm.size, ranks) / max(free, 1.0), ranks, free))
     worst, ranks, free = max(nodes)
     if worst <= 1:
@@ -111,7 +126,7 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
         parts = "tables of hand, loads and outputs"
     else:
         given, key = _size_key(scene)
-        fits = _fitting(scene, comm, run, dimension, cells, share, ranks, free)
+        fits = _fitting(scene, comm.size, run, dimension, cells, share, ranks, free)
         parts = f"mesh and matrices {size_text(share * estimate.mesh)}"
         if estimate.factor:  # conjugate gradients have none
             parts += f", factor {size_text(share * estimate.factor)}"
@@ -124,7 +139,7 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
 
 
 def _fitting(
-    scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, cells: int, share: float, ranks: int, free: float
+    scene: Scene, size: int, run: bool, dimension: int, cells: int, share: float, ranks: int, free: float
 ) -> str:
     """Largest mesh that fits, as text: cells along the edges of a box, or of a mesh file in all."""
     box = scene.tissue.cells if _size_key(scene)[1] == "tissue.cells" else None
@@ -136,7 +151,7 @@ def _fitting(
     for _ in range(60):
         middle = (low + high) / 2
         count = box_simplices(smaller(middle)) if box else smaller(middle)[0]
-        fits = need(scene, dimension, count, comm, run).of(share, ranks) <= free
+        fits = need(scene, dimension, count, size, free, run).of(share, ranks) <= free
         low, high = (middle, high) if fits else (low, middle)
     return f"tissue.cells = {smaller(low)}" if box else f"{smaller(low)[0]} of its {cells} cells"
 

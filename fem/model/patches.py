@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.layout import Patches
+from softgrasp.fem.petsc import to_ranks
 
 
 def make_patches(V: Any, free: NDArray[Any]) -> Patches:
     """Stars of the vertices of a space of order 2 or more, in whatever cells. Collective.
 
     A node of an edge, face or cell is in the stars of the vertices of that entity. A rank lists the stars of the
-    vertices that it owns, as far as its own cells and ghost cells show them.
+    vertices that it owns; what only cells of other ranks show of them is sent to it.
 
     ``free``: owned local numbers of the nodes that are unknowns, ascending.
     """
@@ -41,17 +42,31 @@ def make_patches(V: Any, free: NDArray[Any]) -> Patches:
     is_vertex = np.zeros(every, dtype=bool)
     is_vertex[vertex] = True
     coarse, count = _numbers(index, is_free & is_vertex)
-    mine = (vertex < owned) & (number[node] >= 0)
+    star, inside = _whole(index, vertex[number[node] >= 0], number[node[number[node] >= 0]])
     known = (node < owned) & (number[node] >= 0) & (coarse[vertex] >= 0) & (weight != 0)
     return Patches(
-        star=vertex[mine],
-        node=number[node[mine]],
+        star=star,
+        node=inside,
         row=number[node[known]],
         column=coarse[vertex[known]],
         weight=weight[known],
         vertices=np.flatnonzero(is_vertex[free]),
         count=count,
     )
+
+
+def _whole(index: Any, vertex: NDArray[Any], node: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Pairs of an owned vertex and a node of its star, from those that each rank sees, in order. Collective.
+
+    Ghost cells share a facet with a cell of the rank: of a vertex at the corner of three ranks some cells are missing.
+    """
+    owned, comm = index.size_local, index.comm
+    away = vertex >= owned
+    there = index.local_to_global(vertex[away].astype(np.int32)).astype(np.int64)
+    found = to_ranks(comm, index.owners[vertex[away] - owned], np.column_stack([there, node[away]]))
+    found[:, 0] -= index.local_range[0]
+    pairs = np.unique(np.concatenate([found, np.column_stack([vertex[~away], node[~away]])]), axis=0)
+    return pairs[:, 0], pairs[:, 1]
 
 
 def _numbers(index: Any, marked: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:

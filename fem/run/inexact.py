@@ -3,6 +3,9 @@
 With S w = r - rho the step of `softgrasp.fem.run.midpoint` changes the energy by 2 w'G c - 2 s w'D w - 2 w'rho, if its
 momentum goes on with the product S w in place of r. Scaling w by w'r / w'S w makes w'rho = 0. The solves begin with
 what the last ones tell (`softgrasp.fem.solve.guess`).
+
+A step adds an error of energy 2 rho'S^-1 rho at most, which later steps do not magnify. As these errors point anywhere,
+their energies are summed; the preconditioner stands for S^-1.
 """
 
 from __future__ import annotations
@@ -25,6 +28,9 @@ class InexactMidpoint(TissueMidpoint):
         defect: S w - r, what the momentum goes on with beside r.
         previous: solutions of the last steps.
         iterations: of each solve of a step since the start.
+        squares: sum of |rho|^2 over the steps since the start [N^2].
+        softness: largest rho'S^-1 rho / |rho|^2 of the steps that were checked [m/N].
+        strain: largest elastic energy z'K z / 2 at which the energy was taken [J].
     """
 
     def _prepare(self) -> None:
@@ -39,6 +45,7 @@ class InexactMidpoint(TissueMidpoint):
         super().start(state)
         self.previous.clear()
         self.iterations.clear()
+        self.squares = self.softness = self.strain = 0.0
 
     def _solve_from_guess(self, r: PETSc.Vec, w: PETSc.Vec) -> None:
         """Solve S w = r from a guess, keep w and set S w. Collective."""
@@ -48,6 +55,7 @@ class InexactMidpoint(TissueMidpoint):
         self.solver.solve(r, w)
         ksp.setInitialGuessNonzero(False)
         self.iterations.append(ksp.getIterationNumber())
+        self.squares += ksp.getResidualNorm() ** 2
         self.solver.S.mult(w, self.Sw)
         square = w.dot(self.Sw)
         if square > 0:
@@ -110,11 +118,33 @@ class InexactMidpoint(TissueMidpoint):
         if self.operators.D is None:  # else the momentum is M v and asks for no S w
             self.r.axpy(self.a, self.defect)
 
+    def residual(self) -> float:
+        """Check a solve as the exact step does, and take the softness of its defect. Collective."""
+        square = self.defect.dot(self.defect)
+        if square > 0:
+            y = self.defect.duplicate()
+            self.solver.ksp.getPC().apply(self.defect, y)
+            self.softness = max(self.softness, self.defect.dot(y) / square)
+            y.destroy()
+        return super().residual()
+
+    def energy(self, state: TissueState) -> float:
+        """Energy as of the exact step, and keep the largest elastic one. Collective."""
+        energy = super().energy(state)
+        self.strain = max(self.strain, -self._held_z(state).dot(self.k) / 4)
+        return energy
+
+    def solve_error(self) -> float:
+        """Estimated error of z by all solves, energy norm, over the largest z [1]."""
+        return float(np.sqrt(2 * self.softness * self.squares / self.strain)) if self.strain > 0 else 0.0
+
     def restart_arrays(self) -> dict[str, Array]:
         """Further arrays of a restart file: the solutions of the last steps, and their products."""
         return {
             "solver_rows": self.previous.W.T,
-            "solver_numbers": np.append(self.previous.gram, self.previous.count),
+            "solver_numbers": np.array(
+                [*self.previous.gram.ravel(), self.previous.count, self.squares, self.softness, self.strain]
+            ),
         }
 
     def restore(self, rows: Array | None, numbers: Array | None) -> None:
@@ -122,7 +152,8 @@ class InexactMidpoint(TissueMidpoint):
         if rows is None or numbers is None:
             return
         past = self.previous
-        past.W[:], past.gram[:], past.count = rows.T, numbers[:-1].reshape(past.gram.shape), int(numbers[-1])
+        past.W[:], past.gram[:] = rows.T, numbers[:-4].reshape(past.gram.shape)
+        past.count, (self.squares, self.softness, self.strain) = int(numbers[-4]), numbers[-3:].tolist()
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""

@@ -71,8 +71,7 @@ class Run(Stepped):
 
     def __init__(self, model: Model, options: RunOptions, force: Force | None = None) -> None:
         scene, system = model.scene, model.system
-        self.model = model
-        self.end = scene.time_end
+        self.model, self.end = model, scene.time_end
         dt, (name, reason) = self.end / scene.time.steps, solver_of(scene, system.layout)
         with model.watch.stage("factor"):
             midpoint = make_midpoint(system, dt, name, scene.time.rtol, scene.time.reproducible)
@@ -261,6 +260,7 @@ class Run(Stepped):
             final=self.state.array.copy(),
             energy_drift=self.drift(),
             residuals=(self.residual_first, self.residual_last),
+            solve_error=self.midpoint.solve_error(),
             solver=self.solver,
             seconds=seconds,
             steps_timed=self.counted,

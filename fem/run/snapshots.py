@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from softgrasp.fem.errors import CheckpointError, ResourceError, raise_on_all_ra
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.resources import MARGIN, check_room, free_memory
+from softgrasp.fem.resources import MARGIN, check_room, free_memory, reserve_room
 from softgrasp.fem.run.midpoint import TissueState, state_on
 from softgrasp.fem.shown import Shown
 from softgrasp.fem.system import BlockSystem
@@ -199,7 +198,7 @@ class Hdf5Store(NoStore):
             check_room(comm, [self.path], 8 * len(self.buffer) * (end - self.written))
             with raise_on_all_ranks(comm):
                 try:
-                    _reserve(self.path, 8 * (len(self.buffer) + 1) * (end - self.written) + MARGIN)
+                    reserve_room(self.path, 8 * (len(self.buffer) + 1) * (end - self.written) + MARGIN)
                     with h5py.File(self.path, "r+") as file:
                         for j in range(self.written, end):
                             file["Z"][j] = self.buffer[:, j % self.width]
@@ -265,15 +264,6 @@ class Hdf5Store(NoStore):
             path.write_bytes(image)
         except OSError as error:
             raise ResourceError(f"{path} cannot be written ({error}); remove it or free the disk") from error
-
-
-def _reserve(path: Path, size: int) -> None:
-    """Take room on the disk behind the end of a file: HDF5, which gives back the rest, ends the program without it.
-
-    Raises OSError: there is none, or the user's quota or the limit of a file's size is reached.
-    """
-    with path.open("r+b") as file:
-        os.posix_fallocate(file.fileno(), file.seek(0, os.SEEK_END), size)
 
 
 def spread(count: int, few: int) -> np.ndarray:

@@ -58,6 +58,8 @@ class Trajectory(Shown, Labelled):
     """Relative residuals of the first and of the last solve [1]."""
     solver: SolverUsed
     """Name of the linear solver, reason of its choice, and package."""
+    solve_error: float = 0.0
+    """Estimated error of z by solves that end early, energy norm, over the largest z [1]; 0 with a factor."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time of each stage, of all "steps" and "per_step", on the slowest rank [s]."""
     steps_timed: int = 0

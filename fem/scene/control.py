@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from softgrasp.fem.scene.tissue import Box, Label, Positive, Section, check_box
+from softgrasp.fem.scene.tissue import Box, Dropped, Label, NonNegative, Positive, Section, check_box
 
 Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 
@@ -25,6 +25,11 @@ class Reduction(Section):
 
     methods: list[str] = Field(
         default_factory=list, description="bases by name [no unit]; empty: the paper's six and the best beyond them"
+    )
+    plugins: list[Label] = Field(
+        default_factory=list,
+        description="Python files with bases of your own, whose names `methods` may then take [no unit]; they join the "
+        "comparison, and they run with your rights",
     )
     N: list[Annotated[int, Field(ge=1)]] = Field(
         default_factory=lambda: [4, 6, 8, 10, 12, 14, 18, 22, 26, 30, 40, 60],
@@ -170,6 +175,41 @@ def _check_weight(key: str, weight: Weight, definite: bool) -> None:
         raise ValueError(f"{key} is {weight}; it must be {word}")
 
 
+class Constraints(Section):
+    """Plan of held forces that keeps [[obstacle]] and the limits of the hand, and the margins it takes."""
+
+    force: Positive | list[Positive] | None = Field(
+        None, description="largest force on the hand in each direction [N], one number or one per axis; none by default"
+    )
+    speed: Positive | None = Field(None, description="largest speed of the hand in each direction [m/s]")
+    jump: Positive | None = Field(None, description="largest change of the force from interval to interval [N]")
+    clearance: NonNegative = Field(0.0, description="distance to every obstacle beyond all margins [m]")
+    margin: Literal["bound"] | NonNegative = Field(
+        "bound",
+        description="what the reduced plant may leave out at every node [m]; bound: the exact l1 bound for all forces "
+        "within ``force``",
+    )
+    N: Annotated[int, Field(ge=8)] = Field(
+        22, description="states of the reduced plant of the plan, those of the hand included [1], even"
+    )
+    grid: Positive = Field(1.0, description="interval over which the plan holds the force [s]")
+    parts: Annotated[int, Field(ge=1, le=100)] = Field(8, description="parts of an interval between checks [1]")
+    horizon: Literal["auto"] | Positive = Field(
+        "auto", description="length of the plan [s]; auto: longer until all that follows is proved safe"
+    )
+    penalty: Literal["auto"] | Positive = Field(
+        "auto",
+        description="cost of a metre inside an obstacle where no plan keeps all gaps [1/m]; auto: ten times the mean "
+        "cost of a metre of the way",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Constraints:
+        if self.N % 2:
+            raise ValueError(f"N is {self.N}; displacements and velocities come in pairs, give an even number")
+        return self
+
+
 class Control(Section):
     """Quadratic cost: integral of y' Q y + u' R u."""
 
@@ -190,6 +230,9 @@ class Control(Section):
         description="dimensions of the reduced Riccati equations [1]",
     )
     loop: Loop = Field(default_factory=Loop, description="how the feedback runs [various]")
+    constraints: Dropped[Constraints] = Field(
+        None, description="plan past obstacles and within limits [various]; off unless given"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Control:

@@ -264,7 +264,8 @@ class Scene(Shown, Section):
         for name, layer in self.tissue.layers.items():
             if layer.beta is not None and effects.damping is None:
                 raise ValueError(f"tissue.layers.{name}.beta needs effects.damping; give it or drop beta")
-        check_obstacles(self.obstacle, used=False)
+        planned = self.control is not None and self.control.constraints is not None
+        check_obstacles(self.obstacle, used=planned)
         if self.dimension is not None:
             _check_vectors(self, self.dimension)
         return self
@@ -316,5 +317,6 @@ def check_dimension(scene: Scene, d: int) -> None:
 def scene_schema() -> dict[str, Any]:
     """JSON schema of a scene file, draft 2020-12."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema(by_alias=True)
-    schema["$defs"]["Reduction"]["properties"]["methods"]["items"]["enum"] = list(BASES)
+    own = {"type": "string", "description": "a basis of reduction.plugins"}
+    schema["$defs"]["Reduction"]["properties"]["methods"]["items"] = {"anyOf": [{"enum": list(BASES)}, own]}
     return schema

@@ -1,11 +1,14 @@
 """Model of time and memory of each solver by the number of unknowns and ranks.
 
-`python -m benchmarks solvers` measures set-up and solves of every row and prints measured over modelled times.
+`python -m benchmarks solvers` measures set-up and solves of every row and prints measured over modelled times;
+`python -m benchmarks scale` does so for whole runs and on ranks. Of work that p ranks share each takes 1 / p and some
+for the seams, like (n / p)^(-1/d); of a factor p^-0.62 of the time of one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,14 +16,30 @@ import numpy as np
 SolverName = Literal["cholesky", "mumps", "cg", "stars"]
 ITERATIVE = ("cg", "stars")
 
+Reproducible = Literal["auto"] | bool
+
 Power = tuple[float, float]  # value at 1e5 unknowns, and exponent of the number of unknowns
 # Relative residual at which a step ends [1]. Smooth errors weigh little in the residual of a stiff matrix: of 276
 # random linear scenes cg left up to 3.6e-2 of the deformation at 1e-4, 9.3e-7 at 1e-8.
 STEP_RTOL = {"cg": 1e-8, "stars": 1e-4}
 # Iterations of a step from the last solutions, over those from zero to 1e-8 [1].
 GUESSED = {"cg": 0.6, "stars": 0.3}
+GRADED = 2.5  # iterations on lines that crowd over those on even cells [1]: cg 2.2 to 2.6, stars 2.8
+DAMPED = 0.5  # share of these iterations that damped steps take, for the last solutions tell more of the next [1]
 FEW_SOLVES = 20  # solves of an equilibrium, a mesh estimate or modes with one factor [1]
-PARALLEL = 0.62  # exponent p of the time ranks^-p of work spread over ranks [1]: 0.65 on two ranks, measured
+PARALLEL = 0.62  # exponent p of the time ranks^-p of a factor spread over ranks [1]: 0.65 on two ranks, measured
+SEAMS = {2: 0.1, 3: 0.32}  # share of work at the seams between ranks of 1e5 unknowns each, by dimension [1]
+MESSAGE = 2e-6  # time of a message between nodes [s]: a network's, not measured here
+# By dimension and order: seconds to build a cell, and entries of K an unknown.
+BUILD = {(2, 1): 3.5e-6, (2, 2): 1.7e-5, (2, 3): 5.4e-5, (2, 4): 2e-4,
+         (3, 1): 7e-6, (3, 2): 9e-5, (3, 3): 6.7e-4, (3, 4): 3.5e-3}  # fmt: skip
+ENTRIES = {(2, 1): 14, (2, 2): 23, (2, 3): 34, (2, 4): 46, (3, 1): 40, (3, 2): 77, (3, 3): 123, (3, 4): 198}
+PER_ENTRY = 1e-9  # time of an entry in a product [s]
+# Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. On two ranks a spread one
+# takes 0.68 and 0.65 of the time for solve and set-up at 2e4 unknowns in 3D; a whole one on each 1.4 and 1.2, and the
+# memory of one for each, the price of the same bits. In 2D blocks on every rank beat any spread factor to 2e5.
+REPEATED_LIMIT = {2: 1_000_000, 3: 40_000}
+REPEATED_RANKS = 4
 
 
 @dataclass(frozen=True)
@@ -33,25 +52,27 @@ class Cost:
     most: float  # largest number of unknowns at which the solver is a candidate [1]; a factor does not fit beyond
     fixed: float = 0.0  # time of the set-up that does not depend on the size [s]
     iterations: tuple[float, float] = (1.0, 0.0)  # a, b of a + b sqrt(lambda / mu) iterations from zero to 1e-8 [1]
+    messages: float = 0.0  # messages of one pass that wait for each other, over the binary logarithm of the ranks [1]
 
 
-# By solver, dimension and whether the order is 2 or more. Times of direct solvers follow their entries: n log n and
+# By solver, dimension and whether the order is 2 or more. Messages of iterations are counted on 2 to 8 ranks, those of
+# a factor guessed. Times of direct solvers follow their entries: n log n and
 # n^1.5 in 2D, n^(4/3) and n^2 in 3D, but for the caches; memory of factors is nnz(L) of factor_bytes.
 COSTS: dict[tuple[SolverName, int, bool], Cost] = {
     ("cholesky", 2, False): Cost((0.67, 1.5), (0.0127, 1.1), (800, 0.1), 2e5),
     ("cholesky", 2, True): Cost((0.9, 1.5), (0.017, 1.1), (1000, 0.1), 2e5),
-    ("mumps", 2, False): Cost((0.40, 1.25), (0.030, 0.97), (1000, 0.1), 4e6, fixed=0.033),
-    ("mumps", 2, True): Cost((0.55, 1.25), (0.035, 0.97), (1250, 0.1), 4e6, fixed=0.033),
-    ("cg", 2, False): Cost((0.25, 1.0), (0.006, 1.12), (600, 0.0), np.inf, iterations=(9, 9.6)),
-    ("cg", 2, True): Cost((0.6, 1.0), (0.02, 1.0), (1000, 0.0), np.inf, iterations=(16, 16)),
-    ("stars", 2, True): Cost((1.2, 1.0), (0.02, 1.0), (900, 0.0), np.inf, iterations=(7.4, 3.75)),
+    ("mumps", 2, False): Cost((0.40, 1.25), (0.030, 0.97), (1000, 0.1), 4e6, fixed=0.033, messages=100),
+    ("mumps", 2, True): Cost((0.55, 1.25), (0.035, 0.97), (1250, 0.1), 4e6, fixed=0.033, messages=100),
+    ("cg", 2, False): Cost((0.25, 1.0), (0.006, 1.12), (600, 0.0), np.inf, iterations=(9, 9.6), messages=22),
+    ("cg", 2, True): Cost((0.6, 1.0), (0.02, 1.0), (1000, 0.0), np.inf, iterations=(16, 16), messages=22),
+    ("stars", 2, True): Cost((1.2, 1.0), (0.02, 1.0), (900, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
     ("cholesky", 3, False): Cost((37.0, 2.0), (0.11, 1.5), (13_000, 1 / 3), 2e4),
     ("cholesky", 3, True): Cost((37.0, 2.0), (0.11, 1.5), (13_000, 1 / 3), 2e4),
-    ("mumps", 3, False): Cost((13.1, 2.0), (0.158, 1.5), (10_600, 1 / 3), 3e5, fixed=0.033),
-    ("mumps", 3, True): Cost((12.8, 2.0), (0.144, 4 / 3), (10_600, 1 / 3), 3e5, fixed=0.033),
-    ("cg", 3, False): Cost((0.8, 1.0), (0.022, 1.0), (900, 0.0), np.inf, iterations=(9, 9.6)),
-    ("cg", 3, True): Cost((2.0, 1.0), (0.080, 1.0), (1500, 0.0), np.inf, iterations=(16, 16)),
-    ("stars", 3, True): Cost((2.8, 1.17), (0.044, 1.2), (1400, 0.0), np.inf, iterations=(7.4, 3.75)),
+    ("mumps", 3, False): Cost((13.1, 2.0), (0.158, 1.5), (10_600, 1 / 3), 3e5, fixed=0.033, messages=100),
+    ("mumps", 3, True): Cost((12.8, 2.0), (0.144, 4 / 3), (10_600, 1 / 3), 3e5, fixed=0.033, messages=100),
+    ("cg", 3, False): Cost((0.8, 1.0), (0.022, 1.0), (900, 0.0), np.inf, iterations=(9, 9.6), messages=22),
+    ("cg", 3, True): Cost((2.0, 1.0), (0.080, 1.0), (700, 0.0), np.inf, iterations=(16, 16), messages=22),
+    ("stars", 3, True): Cost((2.8, 1.17), (0.044, 1.2), (3200, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
 }
 
 
@@ -59,41 +80,65 @@ COSTS: dict[tuple[SolverName, int, bool], Cost] = {
 class Work:
     """Size and number of the solves with one matrix."""
 
-    n: int  # number of unknowns [1]
+    n: float  # number of unknowns [1]
     dimension: int  # space dimension d
     order: int  # polynomial order of the elements
     ranks: int  # number of ranks [1]
     solves: int  # number of solves with the matrix [1]
     few: bool  # whether they are static solves to 1e-12, with half again the iterations of 1e-8; else time steps
     contrast: float  # largest lambda / mu of the materials [1]
+    reproducible: Reproducible = "auto"  # time.reproducible of the scene
+    graded: bool = False  # whether cells crowd, so that they are flat and iterations more
+    damped: bool = False  # whether steps are damped, so that the last solutions tell more of the next
 
-    def memory(self, name: SolverName, copies: int = 1) -> float:
+    def repeated(self, name: SolverName) -> bool:
+        """Whether every rank factors by itself: no message in a solve, and the same bits in every run.
+
+        The distributed factor of MUMPS needs less memory, but adds in the order messages arrive, so that its last bits
+        differ from run to run.
+        """
+        if name == "cholesky":
+            return True
+        if self.ranks == 1 or name in ITERATIVE:
+            return False
+        if self.reproducible != "auto":
+            return bool(self.reproducible)
+        return self.ranks <= REPEATED_RANKS and self.n * self.ranks <= REPEATED_LIMIT[self._kind]
+
+    def memory(self, name: SolverName) -> float:
         """Modelled memory of set-up and factor over all ranks [byte]."""
+        copies = self.ranks if self.repeated(name) else 1
         return copies * self.n * self._at(self._cost(name).memory)
 
-    def setup(self, name: SolverName, spread: bool = True) -> float:
+    def setup(self, name: SolverName) -> float:
         """Modelled time of the set-up [s]."""
         cost = self._cost(name)
-        return cost.fixed + self._at(cost.setup) * self._share(spread)
+        return cost.fixed + self._time(cost.setup, name) + self._waits(name)
 
-    def solve(self, name: SolverName, spread: bool = True) -> float:
+    def solve(self, name: SolverName) -> float:
         """Modelled time of one solve [s]."""
-        seconds = self.solve_from_zero(name) * self._share(spread)
-        return seconds * (1.5 if self.few else GUESSED[name]) if name in ITERATIVE else seconds
+        passes = 1.0
+        if name in ITERATIVE:
+            share = GUESSED[name] * (DAMPED if self.damped else 1.0)
+            passes = self.iterations(name) * (1.5 if self.few else share)
+        return passes * (self._time(self._cost(name).pass_, name) + self._waits(name))
 
-    def solve_from_zero(self, name: SolverName) -> float:
-        """Modelled time of one solve on one rank, iterations from zero to 1e-8 [s]."""
-        cost = self._cost(name)
-        a, b = cost.iterations
-        return float((a + b * np.sqrt(max(self.contrast, 0.0))) * self._at(cost.pass_))
+    def iterations(self, name: SolverName) -> float:
+        """Modelled iterations from zero to 1e-8 [1]; 1 by a factor."""
+        a, b = self._cost(name).iterations
+        return float(a + b * np.sqrt(max(self.contrast, 0.0))) * (GRADED if self.graded else 1.0)
 
-    def seconds(self, name: SolverName, spread: bool = True) -> float:
+    def product(self, entries: float) -> float:
+        """Modelled time of a product with a matrix of so many entries an unknown [s]."""
+        return PER_ENTRY * entries * self.n * seams(self.n, self._kind, self.ranks)
+
+    def seconds(self, name: SolverName) -> float:
         """Modelled time of set-up and solves [s]."""
-        return self.setup(name, spread) + self.solves * self.solve(name, spread)
+        return self.setup(name) + self.solves * self.solve(name)
 
     def candidates(self) -> list[SolverName]:
         """Solvers of these elements that are measured at this size; few solves go to a factor while it fits."""
-        kind = (2 if self.dimension < 3 else 3), self.order > 1  # systems without a mesh cost like those in 2D
+        kind = self._kind, self.order > 1
         names = [name for (name, *of), cost in COSTS.items() if tuple(of) == kind and self.n <= cost.most]
         direct = [name for name in names if name not in ITERATIVE]
         return direct if self.few and direct else names
@@ -102,13 +147,62 @@ class Work:
         """The candidate with the least modelled memory."""
         return min(self.candidates(), key=self.memory)
 
+    def choose(self, memory: float = np.inf) -> list[SolverName]:
+        """Candidates whose set-up and factor take at most so much over all ranks [byte], the fastest first.
+
+        Where none does it is the one that takes the least.
+        """
+        fits = [name for name in self.candidates() if self.memory(name) <= memory]
+        return sorted(fits or [self.leanest()], key=self.seconds)
+
+    def solver(self, requested: str = "auto", memory: float = np.inf) -> SolverName:
+        """The solver of a scene's choice: the fastest that fits, unless another is requested."""
+        return self.choose(memory)[0] if requested == "auto" else requested  # type: ignore[return-value]
+
+    def reason(self, requested: str = "auto", memory: float = np.inf) -> str:
+        """The reason of that choice in words."""
+        if requested != "auto":
+            return "asked for by the scene"
+        best, *others = self.choose(memory)
+        text = f"about {self.seconds(best):.2g} s for set-up and {self.solves} solves of n_e = {self.n:.0f}"
+        return text + (f" by the cost model, {others[0]} {self.seconds(others[0]):.2g} s" if others else "")
+
+    def price_of_bits(self, name: SolverName) -> str:
+        """What it costs that each rank holds the whole factor, in words; empty where another way is not quicker."""
+        spread = replace(self, reproducible=False)
+        if name == "cholesky" or not self.repeated(name) or spread.seconds(name) > self.seconds(name):
+            return ""
+        return (
+            f"; each of the {self.ranks} ranks holds the whole factor, for the same bits in every run: with "
+            f"time.reproducible = false about {spread.seconds(name):.2g} instead of {self.seconds(name):.2g} s"
+        )
+
+    @property
+    def _kind(self) -> int:
+        return 2 if self.dimension < 3 else 3  # systems without a mesh cost like those in 2D
+
     def _cost(self, name: SolverName) -> Cost:
-        high = self.order > 1 or name == "stars"
-        return COSTS[name, 2 if self.dimension < 3 else 3, high]
+        return COSTS[name, self._kind, self.order > 1 or name == "stars"]
 
     def _at(self, power: Power) -> float:
         value, exponent = power
         return float(value * (self.n / 1e5) ** exponent)
 
-    def _share(self, spread: bool) -> float:
-        return float(self.ranks**-PARALLEL) if spread else 1.0
+    def _time(self, power: Power, name: SolverName) -> float:
+        """Time on these ranks, but for messages [s]; what iterations take of an unknown grows with a rank's share."""
+        if self.repeated(name):
+            return self._at(power)
+        if name not in ITERATIVE:
+            return self._at(power) * float(self.ranks**-PARALLEL)
+        return replace(self, n=self.n / self.ranks)._at(power) * self.ranks * seams(self.n, self._kind, self.ranks)
+
+    def _waits(self, name: SolverName) -> float:
+        """Time that messages of one pass take at least [s]."""
+        return 0.0 if self.repeated(name) else self._cost(name).messages * math.log2(self.ranks) * MESSAGE
+
+
+def seams(n: float, dimension: int, ranks: int) -> float:
+    """Time of products and assembly of n unknowns on some ranks over that on one [1]."""
+    if ranks == 1:
+        return 1.0
+    return float((1 + SEAMS[dimension] * (n / ranks / 1e5) ** (-1 / dimension)) / ranks)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,19 +20,13 @@ from softgrasp.fem.solve.cholesky import (
 )
 from softgrasp.fem.solve.costs import FEW_SOLVES, Work
 from softgrasp.fem.solve.costs import ITERATIVE as ITERATIVE
+from softgrasp.fem.solve.costs import Reproducible as Reproducible
 from softgrasp.fem.solve.costs import SolverName as SolverName
 from softgrasp.fem.solve.stars import Stars, factored
-
-Reproducible = Literal["auto"] | bool
 
 # Largest problem whose single entries PETSc's own Cholesky factors faster than MUMPS, where blocks lose digits.
 FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}  # 1: systems without a mesh
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}  # above, the factor itself does not fit
-# Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. On two ranks a spread one
-# takes 0.68 and 0.65 of the time for solve and set-up at 2e4 unknowns in 3D; a whole one on each 1.4 and 1.2, and the
-# memory of one for each, the price of the same bits. In 2D blocks on every rank beat any spread factor to 2e5.
-REPEATED_LIMIT = {1: 1_000_000, 2: 1_000_000, 3: 40_000}
-REPEATED_RANKS = 4
 # Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,
 # which grows with the condition though w may be right. One step of refinement measures the error of w itself.
 DIRECT_RESIDUAL = 1e-8
@@ -68,34 +62,18 @@ def choose_solver(
         steps: of the run.
         memory: that set-up and factor may take, over all ranks [byte].
     """
-    if requested != "auto":
-        return requested, "asked for by the scene"  # type: ignore[return-value]
-    n, ranks = layout.n_e, layout.comm.size
-    work = Work(n, layout.dimension, layout.order, ranks, FEW_SOLVES if few else steps, few, contrast)
-    spread = {name: not factor_on_every_rank(layout, name, "auto") for name in work.candidates()}
-    fits = [name for name in spread if work.memory(name, 1 if spread[name] else ranks) <= memory]
-    names = sorted(fits or [work.leanest()], key=lambda name: work.seconds(name, spread[name]))
-    best = names[0]
-    reason = f"about {work.seconds(best, spread[best]):.2g} s for set-up and {work.solves} solves of n_e = {n}"
-    if len(names) > 1:
-        reason += f" by the cost model, {names[1]} {work.seconds(names[1], spread[names[1]]):.2g} s"
-    return best, reason
+    work = work_of(layout, FEW_SOLVES if few else steps, few, contrast)
+    return work.solver(requested, memory), work.reason(requested, memory)
+
+
+def work_of(layout: BlockLayout, solves: int, few: bool, contrast: float, reproducible: Reproducible = "auto") -> Work:
+    """So many solves with a matrix of a layout, on its ranks."""
+    return Work(layout.n_e, layout.dimension, layout.order, layout.comm.size, solves, few, contrast, reproducible)
 
 
 def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: Reproducible) -> bool:
-    """Whether every rank factors by itself: no message in a solve, and the same bits in every run.
-
-    The distributed factor of MUMPS needs less memory, but adds in the order messages arrive, so that its last bits
-    differ from run to run.
-    """
-    ranks = layout.comm.size
-    if solver == "cholesky":
-        return True
-    if ranks == 1 or solver in ITERATIVE:
-        return False
-    if reproducible != "auto":
-        return bool(reproducible)
-    return ranks <= REPEATED_RANKS and layout.n_e * ranks <= REPEATED_LIMIT[layout.dimension]
+    """Whether every rank factors by itself, see :meth:`softgrasp.fem.solve.costs.Work.repeated`."""
+    return work_of(layout, 1, False, 1.0, reproducible).repeated(solver)
 
 
 @dataclass(frozen=True)
@@ -272,7 +250,7 @@ def make_solver(
     if name == "cholesky":
         return _cholesky(S, layout, prefix, tolerance, ordered)
     if name == "stars":
-        return _stars(S, layout, prefix, rtol)
+        return _stars(S, layout, prefix, rtol, tolerance)
     if name == "mumps" and S.comm.size > 1 and factor_on_every_rank(layout, name, reproducible):
         return _repeated(S, layout, prefix, tolerance)
     ksp = PETSc.KSP().create(S.comm)
@@ -355,7 +333,7 @@ def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
         raise SolverError(f"{name}: set-up failed (reason {reason}); {why}")
 
 
-def _stars(S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float) -> TissueSolver:
+def _stars(S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float, tolerance: float) -> TissueSolver:
     """CG with multigrid over vertex stars; flexible where the linear elements are iterated upon. Collective."""
     if layout.patches is None:
         S.destroy()
@@ -373,7 +351,7 @@ def _stars(S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float) -> Tissu
         raise SolverError(f"stars: the set-up failed ({error}); check material and mesh") from error
     finally:
         S.destroy()
-    return TissueSolver("stars", ksp, stars.matrices[0], 10 * rtol, None, stars)
+    return TissueSolver("stars", ksp, stars.matrices[0], tolerance, None, stars)
 
 
 def _set_tolerance(ksp: PETSc.KSP, rtol: float) -> None:

@@ -10,14 +10,16 @@ for quadratic elements it has fewer entries than S.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import scipy.sparse
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from softgrasp.fem.layout import BlockLayout, Patches
-from softgrasp.fem.petsc import Array, PETSc, petsc_options
+from softgrasp.fem.petsc import Array, PETSc, petsc_options, to_ranks
 
 DEGREE = 2  # degree of the Chebyshev polynomial: 3 saves a sixth of the iterations for 1.4 times the time
 COARSE_LIMIT = 20_000  # largest number of unknowns of the linear elements that one rank factors [1]
@@ -61,6 +63,8 @@ class Stars:
         d, p = layout.dimension, self.patches
         q = np.arange(d)
         rows, columns = d * p.row[:, None] + q, d * p.column[:, None] + q
+        ranges = np.asarray(S.getOwnershipRanges(), dtype=np.int64) // d
+        self.blocks = pattern(p, layout.comm, ranges)
         self.P = self._matrix(d * p.count, rows, columns, np.repeat(p.weight, d))
         self.factored = factored(layout)
         self.matrices: tuple[PETSc.Mat, ...] = ()
@@ -71,8 +75,7 @@ class Stars:
         d, ksp = self.layout.dimension, self.ksp
         for old in self.matrices:
             old.destroy()
-        smoother = self._matrix(self.layout.n_local, *star_inverses(S, self.patches, d))
-        smoother.convert("baij")
+        smoother = self._smoother(S)
         linear = S.ptap(self.P)
         linear.setBlockSize(d)
         self._set_rigid_modes(linear)
@@ -102,6 +105,19 @@ class Stars:
         """Package that solves the linear elements, as PETSc reports it."""
         pc = self.ksp.getPC().getMGCoarseSolve().getPC()
         return str(pc.getFactorSolverType() if self.factored else pc.getType()).upper()
+
+    def _smoother(self, S: PETSc.Mat) -> PETSc.Mat:
+        """B in blocks. Collective."""
+        d, size = self.layout.dimension, (self.layout.n_local, self.layout.n_e)
+        B = PETSc.Mat().createBAIJ((size, size), d, nnz=self.blocks, comm=self.layout.comm)
+        for nodes, inverses in star_inverses(S, self.patches, d):
+            stars, m = nodes.shape
+            rows, columns = nodes.ravel().astype(PETSc.IntType), np.repeat(nodes, m, axis=0).ravel()
+            starts = m * np.arange(stars * m + 1, dtype=PETSc.IntType)
+            blocks = inverses.reshape(stars, m, d, m, d).transpose(0, 1, 3, 2, 4).ravel()
+            B.setValuesBlockedIJV(starts, columns.astype(PETSc.IntType), blocks, addv=True, rowmap=rows)
+        B.assemble()
+        return B
 
     def _matrix(self, columns: int, rows: NDArray[Any], at: NDArray[Any], values: Array) -> PETSc.Mat:
         """A matrix of n_local rows from entries of any rank, which are added."""
@@ -134,37 +150,52 @@ def factored(layout: BlockLayout) -> bool:
     return layout.comm.size == 1 and layout.patches().count * layout.dimension <= COARSE_LIMIT
 
 
-def star_inverses(S: PETSc.Mat, patches: Patches, d: int) -> tuple[NDArray[Any], NDArray[Any], Array]:
-    """Rows, columns and values (blocks, d, d) of this rank's share of B: the inverses of its stars. Collective."""
+def star_inverses(S: PETSc.Mat, patches: Patches, d: int) -> Iterator[tuple[NDArray[Any], Array]]:
+    """Nodes (stars, m) and inverses (stars, m d, m d) of this rank's stars, those of one size together. Collective."""
     seen = np.unique(patches.node)
     n = len(seen)
     rows = PETSc.IS().createBlock(d, seen.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
     (local,) = S.createSubMatrices([rows], [rows])
     indptr, columns, values = local.getValuesCSR()
-    blocks = scipy.sparse.csr_matrix((values, columns, indptr), shape=local.getSize()).tobsr((d, d))
-    blocks.sort_indices()
+    size = local.getSize()
     local.destroy()
     rows.destroy()
+    blocks = scipy.sparse.csr_matrix((values, columns, indptr), shape=size).tobsr((d, d))
+    del values, columns
+    blocks.sort_indices()
     keys = np.repeat(np.arange(n, dtype=np.int64), np.diff(blocks.indptr)) * n + blocks.indices
-    member = np.searchsorted(seen, patches.node)
+    for nodes in equal_stars(patches, d):
+        at = np.searchsorted(seen, nodes)
+        m = at.shape[1]
+        key = (at[:, :, None] * n + at[:, None, :]).ravel()
+        place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+        data = np.where((keys[place] == key)[:, None, None], blocks.data[place], 0.0)
+        dense = data.reshape(-1, m, m, d, d).transpose(0, 1, 3, 2, 4).reshape(-1, m * d, m * d)
+        yield nodes, np.linalg.inv(dense)
+
+
+def equal_stars(patches: Patches, d: int) -> Iterator[NDArray[Any]]:
+    """Nodes (stars, m) of stars of one size, in parts whose inverses take little memory."""
     sizes = np.unique(patches.star, return_counts=True)[1]
     first = np.append(0, np.cumsum(sizes))
-    places, inverses = [], []
-    for m in np.unique(sizes):  # stars of one size are inverted together
+    for m in np.unique(sizes):
         stars = np.flatnonzero(sizes == m)
         for part in np.array_split(stars, -(-len(stars) * 8 * (m * d) ** 2 // BYTES)):
-            at = member[first[part][:, None] + np.arange(m)]
-            key = (at[:, :, None] * n + at[:, None, :]).ravel()
-            place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
-            data = np.where((keys[place] == key)[:, None, None], blocks.data[place], 0.0)
-            dense = data.reshape(-1, m, m, d, d).transpose(0, 1, 3, 2, 4).reshape(-1, m * d, m * d)
-            inverse = np.linalg.inv(dense).reshape(-1, m, d, m, d).transpose(0, 1, 3, 2, 4)
-            inverses.append(inverse.reshape(-1, d * d))
-            places.append(key)
-    key, where = np.unique(np.concatenate([*places, np.zeros(0, dtype=np.int64)]), return_inverse=True)
-    data = np.concatenate([*inverses, np.zeros((0, d * d))])
-    total = np.stack([np.bincount(where, data[:, c], minlength=len(key)) for c in range(d * d)], axis=1)
-    q = np.arange(d)
-    i = (d * seen[key // n])[:, None, None] + q[:, None] + np.zeros_like(q)
-    j = (d * seen[key % n])[:, None, None] + q + np.zeros_like(q)[:, None]
-    return i, j, total
+            yield patches.node[first[part][:, None] + np.arange(m)]
+
+
+def pattern(patches: Patches, comm: MPI.Intracomm, ranges: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Blocks in each owned row of nodes of B, with an own column and with another. Collective.
+
+    ``ranges``: first nodes of the ranks and the number of all.
+    """
+    count = int(ranges[-1])
+    parts = [np.unique(at[:, :, None] * count + at[:, None, :]) for at in equal_stars(patches, 1)]
+    key = np.unique(np.concatenate([*parts, np.zeros(0, dtype=np.int64)]))
+    owner = np.searchsorted(ranges, key // count, side="right") - 1
+    key = np.unique(to_ranks(comm, owner, key))
+    low, high = ranges[comm.rank], ranges[comm.rank + 1]
+    row, column = key // count - low, key % count
+    own = (column >= low) & (column < high)
+    blocks = [np.bincount(row[which], minlength=high - low).astype(PETSc.IntType) for which in (own, ~own)]
+    return blocks[0], blocks[1]

@@ -15,7 +15,6 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-import scipy.signal
 
 from softgrasp.fem.petsc import Array
 
@@ -84,8 +83,10 @@ def static_bound(
         np.cumsum(dt * force, out=moved[1:])
         moved += begin
     else:
+        from scipy.signal import convolve  # half a second to import
+
         free, forced = kernel
-        moved[1:] = dt * scipy.signal.convolve(force, forced[:steps])[:steps]
+        moved[1:] = dt * convolve(force, forced[:steps])[:steps]
         moved += begin * free[: steps + 1]
     return np.asarray(moved + (node if gap is None else np.hypot(node, gap)))
 

@@ -18,7 +18,8 @@ static responses to c and the lowest modes over the box; or 0, where that is bet
 e_0 = -K^-1 r_0 is taken out first, with the dual at s = 0.
 
 The gain is that of a residual whose frequencies the duals resolve, as with damping. Without damping the residual rings
-in all modes, and the bound of the energy norm remains the better one.
+in all modes (on the paper's scene 99 % of it lies below the frequency of mode 713 of 956), and the bound of the energy
+norm remains the better one.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ the run of the small basis is the answer, the larger one measures it, and its ow
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import isclose
@@ -206,14 +206,33 @@ class CertifiedModel(Shown):
 
         Args and errors as in :meth:`run`, without the refusal.
         """
+        drive, names = self._given(drive), self.fine.outputs.names
+        found = self._each(many, drive, tolerance, gravity, prove_time_step)
+        return [CertifiedRun(answer.trajectory(drive.dt, names), certificate) for answer, certificate in found]
+
+    def certificates(self, many: Sequence[Materials], drive: Drive | None = None) -> list[Certificate]:
+        """What :meth:`run_batch` proves, without the states."""
+        return [certificate for _, certificate in self._each(many, self._given(drive))]
+
+    def _given(self, drive: Drive | None) -> Drive:
         drive = self.drive if drive is None else drive
         if drive is None:
             raise ModelError("give the motion of the hand, or the force on it; the model holds none", self.fine.name)
+        return drive
+
+    def _each(
+        self,
+        many: Sequence[Materials],
+        drive: Drive,
+        tolerance: float | None = None,
+        gravity: Array | None = None,
+        prove_time_step: bool = False,
+    ) -> Iterator[tuple[Motion, Certificate]]:
+        """Answer and certificate at every parameter."""
         tolerance = self.tolerance if tolerance is None else tolerance
         g = self.fine.gravity if gravity is None else np.asarray(gravity, dtype=float)
         g = np.zeros(len(self.fine.parts["M_hand"])) if g is None else g
         chunk = max(1, TOGETHER // (2 * self.k2 * (drive.steps + 1)))
-        runs = []
         for at in range(0, len(many), chunk):
             for materials, answer, certificate in self._certified(many[at : at + chunk], drive, g):
                 if prove_time_step and drive.finer is not None and certificate.time_step is not None:
@@ -221,9 +240,7 @@ class CertifiedModel(Shown):
                     both = certificate.energy.largest + finer.energy.largest
                     proof = certificate.time_step + float(both) / certificate.energy.size
                     certificate = replace(certificate, time_step_proof=proof)
-                certificate = replace(certificate, tolerance=tolerance, mesh=self.mesh, norm=self.norm)
-                runs.append(CertifiedRun(answer.trajectory(drive.dt, self.fine.outputs.names), certificate))
-        return runs
+                yield answer, replace(certificate, tolerance=tolerance, mesh=self.mesh, norm=self.norm)
 
     def _motions(self, k: int, many: Sequence[Materials], drive: Drive, g: Array, residual: bool) -> list[Motion]:
         model = self.fine if k == self.k2 else self.coarse

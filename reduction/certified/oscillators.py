@@ -5,6 +5,7 @@ With X' M X = 1 and X' K X = omega^2 of the reduced pair, a = X eta and the midp
     eta'' + (alpha + beta omega^2) eta' + omega^2 eta = -X'G c,   c = a_s - g [+ alpha v_s]
 
 turns w = (omega eta, eta') by one 2 x 2 matrix a mode. Blocks of steps are products; no step of Python is a time step.
+Without damping that matrix is a rotation: w_1 + i w_2 turns by one angle a step, and a run is a running sum.
 The same numbers as :func:`softgrasp.reduction.online.run` to rounding, in less time: nothing of size 2 k is factored.
 """
 
@@ -21,6 +22,7 @@ from softgrasp.reduction.operators import Parameters
 from softgrasp.reduction.system import ModelError
 
 STEPS = 24  # of a block: near the root of usual numbers of steps
+AT_ONCE = 32  # modes that turn together: their arrays stay in the cache
 
 
 @dataclass(frozen=True)
@@ -29,10 +31,15 @@ class Modes:
 
     omega: Array  # (k,) [1/s]
     X: Array  # (k, k), X' M X = 1
-    inverse: Array  # X^-1 = X' M
+    M: Array  # mass of the reduced pair, (k, k)
     g: Array  # X'G, (k, n_s)
     alpha: float  # mass-proportional damping [1/s]
     beta: float  # stiffness-proportional damping [s]
+
+    @property
+    def inverse(self) -> Array:
+        """X^-1 = X' M."""
+        return self.X.T @ self.M
 
     @property
     def rate(self) -> Array:
@@ -71,7 +78,7 @@ class SecondOrder:
         except np.linalg.LinAlgError as error:
             raise ModelError("the reduced mass is singular; its basis vectors are linearly dependent") from error
         omega = np.sqrt(np.maximum(squares, 0.0))
-        return Modes(omega, X, X.T @ M, X.T @ p.density(self.G), p.alpha if p.damped else 0.0, p.materials[0].beta)
+        return Modes(omega, X, M, X.T @ p.density(self.G), p.alpha if p.damped else 0.0, p.materials[0].beta)
 
 
 def march(omega: Array, rate: Array, loads: Array, dt: float, start: Array | None = None) -> Array:
@@ -87,6 +94,8 @@ def march(omega: Array, rate: Array, loads: Array, dt: float, start: Array | Non
     Returns:
         w, (m, 2, steps + 1).
     """
+    if not rate.any():
+        return _turned(omega, loads, dt, start)
     (m, steps), h = loads.shape, dt / 2
     b = min(STEPS, steps)
     blocks = -(-steps // b)
@@ -122,4 +131,32 @@ def march(omega: Array, rate: Array, loads: Array, dt: float, start: Array | Non
     states[:, :, 0] = inputs[:, b:, 0]
     moved = (answer @ inputs).reshape(m, b, 2, blocks).transpose(0, 2, 3, 1).reshape(m, 2, blocks * b)
     states[:, :, 1:] = moved[:, :, :steps]
+    return states
+
+
+def _turned(omega: Array, loads: Array, dt: float, start: Array | None) -> Array:
+    """The same without damping: z_n = r^n (z_0 + q sum over j < n of r^(-j-1) f_j), z = w_1 + i w_2, |r| = 1.
+
+    It is z_{n+1} = r z_n + q f_n with r = (1 - i h omega) / (1 + i h omega), q = i dt / (1 + i h omega), h = dt / 2.
+    """
+    (m, steps), h = loads.shape, dt / 2
+    states = np.empty((m, 2, steps + 1))
+    states[:, :, 0] = 0.0 if start is None else start
+    blocks = -(-(steps + 1) // STEPS)
+    angle = -2j * np.arctan(h * omega)
+    near, far = (np.exp(np.multiply.outer(angle, n)) for n in (np.arange(STEPS), STEPS * np.arange(blocks)))
+    gain = 1j * dt / (1 + 1j * h * omega)
+    powers = np.empty((AT_ONCE, blocks, STEPS), dtype=complex)
+    for first in range(0, m, AT_ONCE):
+        part = slice(first, min(first + AT_ONCE, m))
+        count = part.stop - first
+        turn = np.multiply(far[part, :, None], near[part, None], out=powers[:count]).reshape(count, -1)[:, :steps]
+        z = turn.conj()
+        z *= loads[part]
+        np.cumsum(z, axis=1, out=z)
+        z *= gain[part, None]
+        if start is not None:  # a step on, since the powers begin with 1
+            z += (near[part, 1] * (start[part, 0] + 1j * start[part, 1]))[:, None]
+        z *= turn
+        states[part, 0, 1:], states[part, 1, 1:] = z.real, z.imag
     return states

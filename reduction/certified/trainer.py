@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from softgrasp.fem.accuracy import estimate as accuracy
 from softgrasp.fem.accuracy.krylov import krylov_model
@@ -36,7 +35,7 @@ RANDOM = 100  # parameters beside the grid where the finished model is looked at
 ADDED = 10  # of these become points of the training at most, each as the worst one above what the grid has reached
 PLACES = 4  # trained parameters at which the mesh is estimated
 ROUNDING = 1e-11  # of a run's length: what is left of it below is rounding
-WATCHED = 20  # parameters by which the size of the smaller basis is found, before all are looked at
+WATCHED, WORST = 20, 4  # parameters by which the size of the smaller basis is found; of these looked at first
 WORTH = 0.7  # of an output's bound, above which duals are not worth the time that they take in every answer
 DUAL_PLACES = 3  # values of each constant at which duals are made to be good
 SEED = 20
@@ -110,6 +109,8 @@ class Trainer:
         axis = np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
         draws = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 1, 2)
         if layers:
+            from scipy.stats import qmc  # half a second to import
+
             draws = qmc.Halton(2 * len(model.system.materials), scramble=False).random(count**2)
         self.parameters = self.at(draws)
         self.points = [(m[0].lam, m[0].mu) for m in self.parameters]
@@ -202,7 +203,7 @@ class Trainer:
         """The same at any materials and for any model; the ranks share the work. Collective."""
         local, values = many[self.comm.rank :: self.comm.size], np.zeros(len(many))
         for drive in self.drives if local else ():
-            own = np.array([run.certificate.reduction for run in model.run_batch(local, drive)])
+            own = np.array([certificate.reduction for certificate in model.certificates(local, drive)])
             share = values[self.comm.rank :: self.comm.size]
             np.maximum(share, own, out=share)
         parts = self.comm.allgather(values[self.comm.rank :: self.comm.size])
@@ -329,11 +330,16 @@ def smallest(
     """
     watched = [int(i) for i in np.argsort(-np.array(known), kind="stable")[:WATCHED]]
     low, high = 0, model.k2
+
+    def enough(k: int) -> bool:
+        part = replace(model, k=k, certify="two")
+        places = ([many[i] for i in some] for some in (watched[:WORST], watched[WORST:]))
+        return all(max(trainer.bounds_at(each, part), default=0.0) <= tolerance for each in places)
+
     while True:
         while high - low > 1:
             k = (low + high) // 2
-            bounds = trainer.bounds_at([many[i] for i in watched], replace(model, k=k, certify="two"))
-            low, high = (low, k) if max(bounds) <= tolerance else (k, high)
+            low, high = (low, k) if enough(k) else (k, high)
         part = replace(model, k=high, certify="two") if high < model.k2 else model
         bounds = trainer.bounds_at(many, part)
         above = [i for i, bound in enumerate(bounds) if bound > tolerance]

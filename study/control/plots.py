@@ -59,8 +59,7 @@ def figure_gains(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ...]
     ran = [s for s in bases if s.reports]
     bad = False
     with style.paper_style():
-        figure, axes = plt.subplots(3, 1, figsize=(style.COLUMN + 1.8, 6.6), sharex=True)
-        figure.subplots_adjust(left=0.13, right=0.66, bottom=0.07, top=0.93, hspace=0.16)
+        figure, axes = plt.subplots(3, 1, figsize=(style.COLUMN + 1.8, 6.6), sharex=True, layout="constrained")
         for ax, (key, label) in zip(axes, QUANTITIES, strict=True):
             ends = []
             for j, s in enumerate(ran):
@@ -82,7 +81,7 @@ def figure_gains(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ...]
         axes[-1].set_xlabel("N, order of the reduced equation")
         if bad:
             text = "unstable loop; on the edge: error above 1"
-            figure.legend(handles=[Line2D([], [], label=text, **CROSS)], loc="upper left", borderaxespad=0.2)
+            figure.legend(handles=[Line2D([], [], label=text, **CROSS)], loc="outside upper left")
         return style.save(figure, out_png)
 
 
@@ -164,6 +163,10 @@ def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Fr
         files += figure_gains(study.bases, out / "errors.png")
     if study.margins is not None:
         files += style.save(bode(study.margins), out / "bode.png")
+    if study.planned is not None:
+        from softgrasp.study.control.obstacle.plots import draw_plan
+
+        files += draw_plan(study.planned, frames.picture, out)
     # rounding of the eigenvalues of the lowest modes
     noise = 1e-13 * max(float(np.abs(p).max(initial=0.0)) for p in poles.values())
     files += figure_decay(poles, out / "decay.png", noise=noise)

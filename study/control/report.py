@@ -247,6 +247,10 @@ def csv_tables(study: ControlStudy) -> dict[str, Table]:
     inputs = np.vstack([full.inputs, full.inputs[-1:]])
     data = np.column_stack([full.times, full.q_s, full.outputs, inputs, full.cost])
     files = {"trajectory.csv": Table(tuple(names), data.tolist())}
+    if study.planned is not None:
+        from softgrasp.study.control.obstacle.report import plan_table
+
+        files["plan.csv"] = plan_table(study.planned)
     if study.bases:
         files["reduced.csv"] = reduced_table(study.bases)
     if study.retuned:
@@ -275,9 +279,15 @@ def sections(study: ControlStudy, notes: Sequence[Section], result: Section, dra
     def pick(*names: str) -> list[tuple[Path, str]]:
         return [figures[name] for name in names if name in figures]
 
+    planned: list[Section] = []
+    if study.planned is not None:
+        from softgrasp.study.control.obstacle.report import plan_sections
+
+        planned = plan_sections(study.planned, drawn)
     parts = [
         Section("", figures=pick("move.png", "move.gif")),
         *notes,
+        *planned,
         replace(result, figures=pick("histories.png", "decay.png")),
         Section("Equation", equation=control_equation(study.design.model.scene)),
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,9 @@ from softgrasp.lqr.reduced.retune import RetunedGain
 from softgrasp.lqr.reduced.riccati import GainQuality
 from softgrasp.study.forward.result import newton_keys
 from softgrasp.study.report.origin import origin, peak_memory_mb
+
+if TYPE_CHECKING:  # plans are not imported where a scene asks for none
+    from softgrasp.study.control.obstacle.result import PlannedStudy
 
 TITLES = {
     "pod": "POD of P",
@@ -164,6 +167,7 @@ class ControlStudy(GainStudy):
     loops: LoopRuns  # closed loops
     finite: FiniteLoop | None  # the loop on the plant of finite strain; None where the effect is off
     retuned: tuple[Retuned, ...] = ()  # gains over the box
+    planned: PlannedStudy | None = None  # the plan past obstacles; None where the scene asks for none
 
     def distance(self, run: LoopTrajectory) -> Array:
         """Distance of the farthest output to its target at every instant [m], (steps + 1,)."""
@@ -178,6 +182,7 @@ class ControlStudy(GainStudy):
             "retune": [_retuned(r) for r in self.retuned],
             "loop": _loop(self),
             **({} if self.finite is None else {"finite_strain": _finite(self.finite)}),
+            **({} if self.planned is None else {"obstacle": self.planned.result()}),
         }
 
 

@@ -120,6 +120,11 @@ def loop_study(
     """
     duration = plan(feedback, own_end=not note)  # a scene made for control says how long its loop runs
     finite_strain, sampled = model.system.points is not None, feedback.quality.sampled
+    planned = None
+    if control_of(model).constraints is not None:  # first: what has no plan is refused at once
+        from softgrasp.study.control.obstacle.measure import planned_study  # no other scene needs it
+
+        planned = planned_study(feedback, watch, counted(bar, "plan on the full plant"))
     bases: tuple[BasisGains, ...] = ()
     if feedback.modal:
         reason = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
@@ -139,7 +144,7 @@ def loop_study(
     if finite_strain:
         with watch.stage("finite strain"):
             finite = measure.run_finite(feedback, model, loops.full, duration, counted(bar, "loop of finite strain"))
-    study = ControlStudy(feedback, bases, small.controller, small.tick, notes, loops, finite)
+    study = ControlStudy(feedback, bases, small.controller, small.tick, notes, loops, finite, planned=planned)
     return study, frames.close(), _drawn(session, study, frames)
 
 

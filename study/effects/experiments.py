@@ -10,6 +10,7 @@ import numpy as np
 
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array
@@ -67,15 +68,18 @@ def force_of_motion(scene: Scene, model: Model) -> Force:
     return force
 
 
-class Experiments:
+class SwitchRuns:
     """Runs of one scene with any set of its effects on, each made once. Collective.
 
     Where a control problem lets a force move the hand that the run moves by itself, every run has a second one under
-    the force that would make that motion. ``models`` are built already, the scene's own among them.
+    the force that would make that motion. ``models`` are built already, the scene's own among them; ``mesh`` is that of
+    all, None where each makes its own.
     """
 
-    def __init__(self, scene: Scene, scales: Scales, models: dict[Names, Model]) -> None:
-        self.scene, self.scales, self.models = scene, scales, models
+    def __init__(
+        self, scene: Scene, scales: Scales, models: dict[Names, Model], mesh: TissueMesh | None = None
+    ) -> None:
+        self.scene, self.scales, self.models, self.mesh = scene, scales, models, mesh
         self.on: Names = frozenset(name for name, effect in EFFECTS.items() if effect.active(scene))
         own = models[self.on]
         self.comm = own.system.layout.comm
@@ -109,7 +113,7 @@ class Experiments:
         if on in self.models:
             return self.models[on]
         gc.collect()
-        return build(self.variant(on), comm=self.comm)
+        return build(self.variant(on), comm=self.comm, mesh=self.mesh)
 
     def shown(self, on: Names, forced: bool) -> Names:
         """Those of the effects that a run can show: a motion that is prescribed feels no reaction.
@@ -153,12 +157,14 @@ class Experiments:
         return None if control is None or control <= tolerance else (control, True)
 
 
-def check_elements(model: Model, trajectory: Trajectory, tolerance: float) -> Elements | None:
+def check_elements(
+    model: Model, trajectory: Trajectory, tolerance: float, mesh: TissueMesh | None = None
+) -> Elements | None:
     """Run the scene with P2 when it has P1 and a ratio of Poisson at which P1 locks, else None. Collective."""
     nu = max(young_poisson(m.lam, m.mu)[1] for m in model.system.materials)
     if model.scene.tissue.order != 1 or nu <= LOCKING + 1e-9:
         return None
-    other = build(quadratic(model), comm=model.system.layout.comm)
+    other = build(quadratic(model), comm=model.system.layout.comm, mesh=mesh)
     change = compare(displacements(model, trajectory), displacements(other, simulate(other, RunOptions())))
     needed = change.outputs > tolerance
     text = (

@@ -21,12 +21,13 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.checksums import digest
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.solvers import ITERATIVE
-from softgrasp.study.effects.result import Cost, OffProof
+from softgrasp.study.effects.result import Cost, ZeroCostCheck
 from softgrasp.study.effects.switch import neutral
 from softgrasp.study.shell.timing import RepeatableRun, interleave, medians, rotated
 
@@ -53,6 +54,7 @@ class MeasuredScene:
     # what PETSc's log counts as created by build, factor, start and the first step, by class
     objects: dict[str, int] = field(default_factory=dict)
     objects_in_steps: dict[str, int] = field(default_factory=dict)  # PETSc objects created by the next steps, by class
+    mesh: TissueMesh | None = None  # shared with other scenes; None where each makes its own
 
 
 def bare_output(scene: Scene) -> Scene:
@@ -87,7 +89,7 @@ def matrix_memory(A: PETSc.Mat) -> float:
     return float(entries * (8 + integer / block) + integer * (A.getSize()[0] + 1))
 
 
-def holdings(model: Model, run: Run) -> dict[str, float]:
+def memory_by_object(model: Model, run: Run) -> dict[str, float]:
     """Memory of each matrix, vector and array that model and run hold, over all ranks [byte]. Collective.
 
     Found by looking through the objects, so that nothing an effect allocates can be forgotten. Views count once; what
@@ -133,7 +135,11 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
 
 
 def measure_builds(
-    comm: MPI.Intracomm, scenes: dict[str, Scene], repeats: int, tick: Callable[[], None]
+    comm: MPI.Intracomm,
+    scenes: dict[str, Scene],
+    repeats: int,
+    tick: Callable[[], None],
+    mesh: TissueMesh | None = None,
 ) -> dict[str, MeasuredScene]:
     """Build and factor every scene in rotated order, ``repeats`` times or for `BUILD_SECONDS`. Collective."""
     cases: dict[str, MeasuredScene] = {}
@@ -141,10 +147,10 @@ def measure_builds(
 
     def once(name: str) -> None:
         nonlocal spent
-        model = build(scenes[name], comm=comm)
+        model = build(scenes[name], comm=comm, mesh=mesh)
         with model.watch.stage("setup"):
             run = Run(model, RunOptions())
-        case = cases.setdefault(name, MeasuredScene(model))
+        case = cases.setdefault(name, MeasuredScene(model, mesh=mesh))
         for stage in ("mesh", "assembly", "setup"):
             case.seconds.setdefault(stage, []).append(model.watch.seconds[stage])
             spent += model.watch.seconds[stage]
@@ -175,7 +181,7 @@ def measure_steps(comm: MPI.Intracomm, cases: dict[str, MeasuredScene], repeats:
         for name, case in cases.items():
             case.flops = steppers[name].flops()
             case.prints = operator_hashes(case.model, steppers[name].run)
-            case.bytes = holdings(case.model, steppers[name].run)
+            case.bytes = memory_by_object(case.model, steppers[name].run)
     finally:
         for stepper in steppers.values():
             stepper.destroy()
@@ -217,14 +223,17 @@ def counting(comm: MPI.Intracomm) -> Iterator[dict[str, int]]:
     counts.update(created(comm) - before)
 
 
-def objects_of(comm: MPI.Intracomm, scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
+def objects_of(
+    comm: MPI.Intracomm, scene: Scene, mesh: TissueMesh | None = None
+) -> tuple[dict[str, int], dict[str, int]]:
     """Objects that PETSc's log sees created up to the first step of a run from rest, and in the next ones. Collective.
 
     The static solve of a start in equilibrium belongs to the start and no effect: gravity is tried with it, not before.
     Turns on PETSc's log, which takes a tenth of a short step: not before times are measured.
     """
     with counting(comm) as at_first:
-        stepper = RepeatableRun(build(scene.changed(lambda table: table["time"].update(start="rest")), comm=comm))
+        resting = scene.changed(lambda table: table["time"].update(start="rest"))
+        stepper = RepeatableRun(build(resting, comm=comm, mesh=mesh))
         stepper.run.advance_to(stepper.ts, min(1, stepper.run.steps))
     with counting(comm) as in_steps:
         stepper.run.advance_to(stepper.ts, min(1 + STEPS, stepper.run.steps))
@@ -273,19 +282,19 @@ def difference(more: dict[str, int], less: dict[str, int]) -> dict[str, int]:
     return {name: d for name in sorted({*more, *less}) if (d := more.get(name, 0) - less.get(name, 0))}
 
 
-def prove_off(name: str, before: MeasuredScene, again: MeasuredScene) -> OffProof:
+def check_zero_cost(name: str, before: MeasuredScene, again: MeasuredScene) -> ZeroCostCheck:
     """Compare the scene before and after the effect was on in this process. Collective."""
     layout = before.model.system.layout
     prints, counts = [again.prints], [(again.objects, again.objects_in_steps)]
     with_zero = neutral(before.model.scene, name, layout.dimension)
     if with_zero is not None:
-        model = build(with_zero, comm=layout.comm)
+        model = build(with_zero, comm=layout.comm, mesh=before.mesh)
         run = Run(model, RunOptions())
         prints.append(operator_hashes(model, run))
         run.midpoint.destroy()
         if before.objects:
-            counts.append(objects_of(layout.comm, with_zero))
-    return OffProof(
+            counts.append(objects_of(layout.comm, with_zero, before.mesh))
+    return ZeroCostCheck(
         same_operators=all(p == before.prints for p in prints),
         same_objects=not before.objects_in_steps and all(c == (before.objects, {}) for c in counts),
         same_work=again.flops == before.flops,

@@ -13,18 +13,27 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
+from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.errors import ResourceError, SolverError
-from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import free_bytes, size_text
 from softgrasp.fem.model.scales import rigid_inertia
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.effects.experiments import Experiments, check_elements
-from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, ends, measure_builds, measure_steps, objects_of
+from softgrasp.study.effects.experiments import SwitchRuns, check_elements
+from softgrasp.study.effects.measure import (
+    AGAIN,
+    SCENE,
+    MeasuredScene,
+    bare_output,
+    ends,
+    measure_builds,
+    measure_steps,
+    objects_of,
+)
 from softgrasp.study.effects.page import compose
 from softgrasp.study.effects.result import EffectsStudy
 from softgrasp.study.effects.switch import Scales, switches
 from softgrasp.study.effects.together import Changes, advised
-from softgrasp.study.effects.verdict import find, shows
+from softgrasp.study.effects.verdict import assess, shows
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.shell.folder import folder_lock
@@ -46,7 +55,8 @@ def study_effects(
         ResourceError: the factors of all variants would not fit in memory at once.
     """
     scene = bare_output(scene)
-    model = build(scene, comm=comm)  # also compiles the forms
+    model = adapt.build(scene, comm=comm)  # also compiles the forms
+    mesh = adapt.adapted_mesh(model)
     explanation = explain_model(model)
     omega = explanation.time.omega
     first = float(omega[0]) if len(omega) else None
@@ -61,9 +71,10 @@ def study_effects(
         if progress is not None:
             progress(next(steps), (2 * repeats + 1) * len(scenes))
 
-    cases = measure_builds(comm, scenes, repeats, tick)
+    cases = measure_builds(comm, scenes, repeats, tick, mesh)
     on = frozenset(s.name for s in effects if s.on)
-    runs = Experiments(scene, scales, {on: cases[SCENE].model} | {on ^ {s.name}: cases[s.name].model for s in tried})
+    models = {on: cases[SCENE].model} | {on ^ {s.name}: cases[s.name].model for s in tried}
+    runs = SwitchRuns(scene, scales, models, mesh)
     changes: Changes = {}
     for s in tried:
         try:
@@ -80,16 +91,16 @@ def study_effects(
         s.name for s in tried if s.name in changes and shows(s, changes[s.name], explanation.effects[s.name], scene)
     )
     together = advised(runs, needed, changes)
-    elements = check_elements(runs.models[on], runs.first, scene.study.tolerance)
+    elements = check_elements(runs.models[on], runs.first, scene.study.tolerance, mesh)
     measure_steps(comm, cases, repeats, tick)
     for name, case in cases.items():
-        case.objects, case.objects_in_steps = objects_of(comm, scenes[name])
+        case.objects, case.objects_in_steps = objects_of(comm, scenes[name], mesh)
     base, again = cases[SCENE], cases[AGAIN]
     ratio = np.array(again.seconds["step"]) / np.array(base.seconds["step"]) - 1
     noise = max(TIMER, float(np.abs(ratio).max()))
     layout = model.system.layout
     return EffectsStudy(
-        findings=tuple(find(s, explanation, cases, changes, together, noise) for s in effects),
+        findings=tuple(assess(s, explanation, cases, changes, together, noise) for s in effects),
         advised=together.on,
         beside=together.beside,
         explanation=explanation,
@@ -98,12 +109,19 @@ def study_effects(
         builds=len(base.seconds["setup"]),
         noise=ends(ratio),
         noise_quartiles=ends(ratio, 0.25),
-        base={stage: float(np.median(base.seconds[stage])) for stage in ("mesh", "assembly", "setup", "step")}
-        | {"memory": sum(base.bytes.values()), "flops": base.flops},
+        base=_cost_of(base, None if mesh is None else model.watch.seconds["mesh"]),
         sizes={name: getattr(layout, name) for name in ("n_s", "n_e", "states")}
         | {"steps": scene.time.steps, "cells": explanation.sizes.cells},
         elements=elements,
     )
+
+
+def _cost_of(case: MeasuredScene, mesh: float | None) -> dict[str, float]:
+    """Times [s], memory [byte] and operations of a scene; ``mesh``: time of a mesh that all share, None of its own."""
+    times = {stage: float(np.median(case.seconds[stage])) for stage in ("mesh", "assembly", "setup", "step")}
+    if mesh is not None:
+        times["mesh"] = mesh
+    return times | {"memory": sum(case.bytes.values()), "flops": case.flops}
 
 
 def check_variants(scene: Scene, comm: MPI.Intracomm, explanation: Explanation, variants: int) -> None:

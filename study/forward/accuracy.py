@@ -69,7 +69,7 @@ def accuracy_report(result: MeshEstimate | None, run: Trajectory) -> AccuracyRep
     error, bound = percent(result.estimate), percent(result.bound)
     where = "on this mesh"
     if result.by == "coarser":
-        where = "or less, as estimated on coarser cells (simulate --certify estimates it on these)"
+        where = "as extrapolated from coarser cells (simulate --certify estimates it on these)"
     errors = [
         f"The error of the deformation is about {error} {where}, with a bound of {bound}, and about "
         f"{percent(result.time_error)} by the time step."

@@ -20,7 +20,7 @@ LOCKING = 0.49  # where `effects` measures it
 COARSE_STEP = 0.05  # dt / T_1: the midpoint rule lengthens a period by (omega dt)^2 / 12, here 0.8 %
 SMALL_ANGLE = 0.1  # [rad]: a linearised rotation stretches by angle^2 / 2, here 0.5 %
 EXACT = 1e-9  # a well conditioned direct solve leaves a drift of 1e-16 to 1e-12 and a residual below 1e-13
-ITERATED = 1e-3  # residual of a step that leaves up to 1e-3 of the deformation, the energy still exact
+ITERATED = 1e-3  # residual of an iterated step, or estimated error of all, up to which nothing is said
 LOOKED_AT = 25  # stored instants that strain and frequency are taken from,
 LARGEST = 4_000_000  # fewer where they would be more numbers than this: their products need as much again
 
@@ -57,19 +57,26 @@ def turned(angle: float) -> list[str]:
     return [f"An angle of {angle:.3g} rad is not small: the linearised rotation stretches by {angle**2 / 2:.1%}."]
 
 
-def inexact(drift: float, residual: float, solver: str, nu: float, rounding: float = 0.0) -> list[str]:
-    """Drift of the energy, residual of a solve or loss to rounding, as the digits they leave; all are relative.
+def inexact(
+    drift: float, residual: float, solver: str, nu: float, rounding: float = 0.0, solves: float = 0.0
+) -> list[str]:
+    """Drift of the energy, residual or error of solves or loss to rounding, as the digits they leave; all are relative.
 
-    The drift is of energy that nothing explains, and counts for direct solvers; ``rounding`` is of :func:`magnified`.
+    The drift is of energy that nothing explains; ``rounding`` is of :func:`magnified`, ``solves`` the solve_error of a
+    trajectory.
     """
     iterated = solver in ITERATIVE
-    within = iterated and residual <= ITERATED
-    shares = {"residual": 0.0 if within else residual, "energy drift": drift, "rounding of K": rounding}
+    early = {"residual": residual, "estimated error of the solves": solves}
+    shares = {
+        **{name: 0.0 if iterated and share <= ITERATED else share for name, share in early.items()},
+        "energy drift": drift,
+        "rounding of K": rounding,
+    }
     name = max(shares, key=lambda key: shares[key])
     worst = shares[name]
     if not worst > EXACT:
         return []
-    if iterated and name == "residual":
+    if iterated and name in early:
         reason = f"time.rtol lets {solver} stop there; a smaller one brings more"
     elif nu > 0.4999:
         reason = f"nu = {_near_half(nu)} makes the matrix of a step nearly singular, which magnifies rounding"
@@ -115,7 +122,12 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
         )
     texts += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
     return texts + inexact(
-        run.energy_drift, max(run.residuals), run.solver[0], max(poisson.values()), magnified(system, z)
+        run.energy_drift,
+        max(run.residuals),
+        run.solver[0],
+        max(poisson.values()),
+        magnified(system, z),
+        run.solve_error,
     )
 
 

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.accuracy.estimate import extrapolated
 from softgrasp.fem.effects import EFFECTS, Gate
 from softgrasp.fem.effects.gate import SMALL_SHARE, Sag
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.mesh.singular import expected_order
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.model.memory import Need, factor_bytes, need, solver_of
+from softgrasp.fem.model.memory import Need, factor_bytes, free_bytes, need, solver_of
 from softgrasp.fem.model.refined import by_lines, scene_ends
 from softgrasp.fem.model.scales import SMALL_STRAIN, measure
+from softgrasp.fem.run.forecast import Forecast, forecasts
 from softgrasp.fem.run.motion import largest_acceleration
 from softgrasp.fem.run.snapshots import spread
 from softgrasp.fem.scene.scene import Scene
@@ -27,6 +29,9 @@ from softgrasp.study.forward.cautions import coarse, locking, looked_at, poisson
 from softgrasp.study.forward.result import ModelSizes, model_sizes, output_places
 from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.files import to_json
+
+if TYPE_CHECKING:  # plans are not imported where a scene asks for none
+    from softgrasp.lqr.design.constrained import PlanSizes
 
 MODES = 6
 MOST_LOOKED_AT = {2: 20_000, 3: 6_000}  # unknowns that modes and sag are computed on
@@ -83,7 +88,7 @@ class MeshReport:
     order: float  # expected order of the outputs in n_e^(1/d) d/2, that is in the cell size h on even meshes [1]
     graded: bool  # whether cells shrink towards the ends
     first: bool  # whether a run may refine this mesh further
-    coarser: bool  # whether the estimate is that of coarser cells, so that the error is about as large or less
+    coarser: bool  # whether the estimate is extrapolated from coarser cells
     estimate: float | None  # estimated relative error of the deformation [1]; None where it takes long
     bound: float | None  # bound on the relative error of the deformation [1]; None where it takes long
     time_error: float | None  # that of the time steps [1]
@@ -107,11 +112,13 @@ class Explanation:
     warnings: tuple[str, ...]  # one sentence each
     outputs: dict[str, str]  # name and place of each output
     memory: Need  # estimated need of mesh, factor and steps
+    forecasts: tuple[Forecast, ...]  # modelled cost of the run by the number of ranks; none at finite strain
     snapshot_columns: int  # number of states that the run stores in memory
     snapshot_bytes: int  # memory of these states over all ranks [byte]
     mesh: MeshReport  # singular ends, and the error they leave
     coarser: int  # unknowns of the coarser copy of a large mesh that gives modes, sag and estimate [1]; 0: none
     dimension: int  # 2 or 3
+    plan: PlanSizes | None = None  # of the plan past obstacles that `control` makes; None where it makes none
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dicts, lists and numbers for JSON; what is not known is None."""
@@ -169,13 +176,24 @@ def explain_model(model: Model) -> Explanation:
         sag=problem.sag,
         warnings=(*model.space.mesh.notes, *_warnings(scene, poisson, omega, dt, d, reports, problem.sag)),
         outputs=output_places(model),
-        memory=need(scene, d, sizes.cells, layout.comm, run=True),
+        memory=need(scene, d, sizes.cells, ranks, layout.comm.allreduce(free_bytes(scene), MPI.MIN), run=True),
+        forecasts=forecasts(model),
         snapshot_columns=columns,
         snapshot_bytes=16 * layout.n_e * columns,
         mesh=mesh_report(model, looked),
         coarser=0 if looked is model else small.layout.n_e,
         dimension=d,
+        plan=_plan(model),
     )
+
+
+def _plan(model: Model) -> PlanSizes | None:
+    """Sizes of the quadratic program of `control`. Collective."""
+    if model.scene.control is None or model.scene.control.constraints is None:
+        return None
+    from softgrasp.lqr.design.constrained import plan_sizes  # no other scene needs it
+
+    return plan_sizes(model)
 
 
 def coarser_copy(model: Model) -> Model:
@@ -208,8 +226,9 @@ def mesh_report(model: Model, looked: Model) -> MeshReport:
     order = 2.0 * scene.tissue.order if ends is None else expected_order(ends, scene.tissue.order, graded, edges)
     error = estimate_error(model, ESTIMATE_SECONDS)[0]
     if error is None and looked is not model:
-        error = estimate_error(looked, ESTIMATE_SECONDS)[0]
-    coarse = error is not None and (error.by == "coarser" or error.n_e != model.system.layout.n_e)
+        found = estimate_error(looked, ESTIMATE_SECONDS)[0]
+        error = None if found is None else extrapolated(found, model)
+    coarse = error is not None and error.by == "coarser"
     values = (None,) * 4 if error is None else (error.estimate, error.bound, error.time_error, error.shift)
     first = refine is not None and refine.tolerance is not None and refine.passes > 0
     return MeshReport(kinds, order, graded, first, coarse, *values)

@@ -11,12 +11,19 @@ from rich.console import Console
 from softgrasp.fem.effects.gate import SMALL_SHARE
 from softgrasp.fem.model.memory import size_text
 from softgrasp.fem.model.scales import SMALL_STRAIN
+from softgrasp.fem.run.forecast import RELIABLE, START, Forecast
 from softgrasp.study.forward.explain import EffectReport, Explanation, MeshReport, explain
 from softgrasp.study.report.origin import origin
 from softgrasp.study.report.page import EQUATION, Section
 from softgrasp.study.report.tables import listed, percent
 from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Page, Session
+
+OPERATORS = (
+    "Operators are matrices and columns over the mesh. `softgrasp effects` adds up the memory of all that a run holds, "
+    "with vectors and small arrays."
+)
+FORECAST = ("ranks", "solver", "mesh, assembly", "set-up", "equilibrium", "steps", "fields", "in all", "memory")
 
 
 @folder_lock()
@@ -51,11 +58,14 @@ def sections(result: Explanation) -> list[Section]:
         ("snapshots", f"{result.snapshot_columns} columns, {size_text(result.snapshot_bytes)}"),
         ("time", f"{t.steps} steps of {t.dt:.4g} s to {t.end:.4g} s"),
     ]
+    if (plan := result.plan) is not None:
+        program = f"{plan.variables} variables, {plan.rows} rows, {plan.intervals} intervals of {plan.grid:g} s"
+        sizes.append(("plan of control, longer where its end is not safe", f"N = {plan.N}, {program}"))
     effects = [
         (f"{name}: {verdict(e)}", ". ".join(filter(None, (e.gate.comparison, e.gate.sentence))))
         for name, e in result.effects.items()
     ]
-    costs = [(name, f"It adds {e.term} and allocates {listed(e.operators)}. {e.cost}")
+    costs = [(name, f"It adds {e.term} and {_operators(e.operators)}. {e.cost}")
              for name, e in result.effects.items() if e.on]  # fmt: skip
     periods = [(k, w, T, t.dt / T) for k, (w, T) in enumerate(zip(t.omega, t.periods, strict=True), 1)]
     modes = ("mode", "omega [1/s]", "period [s]", "dt / period")
@@ -67,13 +77,32 @@ def sections(result: Explanation) -> list[Section]:
     parts = [
         Section(EQUATION, code="\n".join(result.equation.plain().lines()), equation=result.equation),
         Section("Sizes", rows=sizes),
+        *forecast_section(result.forecasts),
         Section("At rest under its weight, the hand held still", rows=sag_rows(result)),
         Section("Mesh", text="\n\n".join([*copied, *mesh_lines(result.mesh, result.dimension)])),
         Section("Effects", rows=effects),
-        *([Section("What is on", rows=costs)] if costs else []),
+        *([Section("What is on", OPERATORS, rows=costs)] if costs else []),
         Section("First modes of the clamped tissue", no_modes, header=modes if periods else (), rows=periods),
     ]
     return [replace(part, terminal=True) for part in parts]
+
+
+def _operators(names: Sequence[str]) -> str:
+    return f"the operator{'s' * (len(names) > 1)} {listed(names)}" if names else "no operator"
+
+
+def forecast_section(forecasts: Sequence[Forecast]) -> list[Section]:
+    """Modelled time and memory of the run by the number of ranks."""
+    rows = [
+        (f.ranks, f.solver, *(f"{x:.2g} s" for x in (f.build, f.setup, f.equilibrium, f.steps, f.fields, f.seconds)),
+         size_text(f.memory))
+        for f in forecasts
+    ]  # fmt: skip
+    text = (
+        f"A model, {RELIABLE}. Ranks beyond the cores of this node are on more nodes like it. {START:g} s in all are "
+        "for the start and a page; pictures and the estimate of the mesh come on top."
+    )
+    return [Section("What simulate costs, by the cost model", text, header=FORECAST, rows=rows)] if rows else []
 
 
 def summary(result: Explanation) -> list[str]:
@@ -123,7 +152,7 @@ def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
     if report.estimate is not None and report.bound is not None and report.time_error is not None:
         lines.append(
             f"The error of the deformation is about {percent(report.estimate)} "
-            f"{'or less, as estimated on coarser cells' if report.coarser else 'on this mesh'} "
+            f"{'as extrapolated from coarser cells' if report.coarser else 'on this mesh'} "
             f"(bound {percent(report.bound)}), and {percent(report.time_error)} by the time step."
         )
     else:

@@ -15,6 +15,7 @@ from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError, SolverError
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.run.checkpoint import check_ranks
+from softgrasp.fem.run.forecast import forecasts, told
 from softgrasp.fem.run.simulate import FRAMES, LIGHT, Run, RunOptions, frame_count, simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estimate_error
@@ -58,8 +59,8 @@ def run_simulate(
     model = session.model(scene)
     model.system.release()
     scene, frames, n_e = model.scene, Frames(model, out, session.pictures), model.system.layout.n_e
-    if few := _few_fields(scene, n_e):
-        console.print(few, soft_wrap=True)
+    for text in filter(None, (told(forecasts(model)), _few_fields(scene, n_e))):
+        console.print(text, soft_wrap=True)
 
     def join(run: Run) -> None:
         frames.begin(run)

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import rich.table
 from mpi4py import MPI
-from rich.console import Console
 
 from softgrasp.study.precision import plots
 from softgrasp.study.precision.answer import seconds_text
@@ -40,7 +37,7 @@ from softgrasp.study.report.equation import control_equation
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import command_line, origin, peak_memory_mb
 from softgrasp.study.report.page import EQUATION, Section
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report.tables import percent
 from softgrasp.study.shell.session import Page, Session
 
 PAPER = f"{PAPER_REDUCED} s and a state error of about 1e-3 at N = 14"
@@ -76,11 +73,13 @@ def write_study(session: Session, study: WorkStudy, request: Request) -> dict[st
 
     def page() -> Page:
         figures = draw(study, request.budget, session.out)
-        sections = _sections(study, commands, {f.stem: f for f in figures if f.suffix == ".png"})
-        title = f"{study.scene.name}: accuracy against time"
-        return Page(title, summary(study), sections, {"points.csv": points_table(study)}, figures, request.options)
+        parts = _sections(study, commands, {f.stem: f for f in figures if f.suffix == ".png"})
+        missed = [answer.sentences[0] for answer in study.answers if not answer.met]
+        return Page(
+            f"{study.scene.name}: accuracy against time", summary(study), parts, {"points.csv": points_table(study)},
+            figures, request.options, errors=[a.sentences[0] for a in study.answers if a.met], warnings=missed,
+        )  # fmt: skip
 
-    show(session.console, study, commands)
     session.write(study.scene, result, page)
     comm.Barrier()
     return result
@@ -88,17 +87,17 @@ def write_study(session: Session, study: WorkStudy, request: Request) -> dict[st
 
 def summary(study: WorkStudy) -> list[str]:
     """What came out, in three sentences."""
-    texts = [answer.sentences[0] for answer in study.answers]
+    texts = []
     for name, question in study.questions.items():
         if front := front_of(question.points):
-            (slow, low), (fast, high) = ((seconds_text(p.seconds), f"{p.error:.1e}") for p in (front[-1], front[0]))
+            (slow, low), (fast, high) = ((seconds_text(p.seconds), percent(p.error)) for p in (front[-1], front[0]))
             texts.append(
-                f"{TITLES[name]}: {len(front)} of {len(question.points)} points are beaten by no other, from the error "
-                f"{high} in {fast} to {low} in {slow}."
+                f"{TITLES[name]}: {len(front)} of {len(question.points)} points are beaten by no other, from an error "
+                f"of {high} in {fast} to {low} in {slow}."
             )
     if study.truth is not None:
-        texts.insert(2, f"The reference itself is known to {study.truth.error:.1e} of the deformation.")
-    return texts[:3]
+        texts.append(f"The reference itself has an error of {percent(study.truth.error)} of the deformation.")
+    return [*texts, f"{study.measured} runs were measured, {study.cached} come from the cache."]
 
 
 def draw(study: WorkStudy, budget: float | None, out: Path) -> list[Path]:
@@ -125,45 +124,6 @@ def draw(study: WorkStudy, budget: float | None, out: Path) -> list[Path]:
     return files
 
 
-def show(console: Console, study: WorkStudy, commands: list[dict[str, str]]) -> None:
-    """Print fronts, slopes and answers. Rank 0 prints."""
-    if study.truth is not None:
-        console.print(study.truth.note, markup=False)
-    for name, question in study.questions.items():
-        if question.points and name != "bases":
-            text = reference_text(question, paper_of(study.scene) == "control")
-            if text:
-                console.print(text, markup=False)
-            console.print(_narrow(question_table(name, question.points, front_only=True), console.width))
-    console.print(_narrow(slope_table(study), console.width))
-    for titles, reason in _left_out(study):
-        console.print(f"{titles}: left out, {reason}", markup=False)
-    for full in _paper_run(study):
-        console.print(f"The paper: {PAPER_FULL} s for the full run, here {full.seconds:.3g} s; {PAPER}.", markup=False)
-    for budget in study.error_budgets:
-        console.print(_narrow(budget_table(budget), console.width))
-        console.print(budget.sentence, markup=False, soft_wrap=True)
-    for answer, lines in zip(study.answers, commands, strict=True):
-        style = "bold" if answer.met else "bold red"
-        for k, sentence in enumerate(answer.sentences):
-            console.print(sentence, style=style if k == 0 else None, markup=False, soft_wrap=True)
-        for command in lines.values():
-            console.print(f"  {command}", markup=False, soft_wrap=True)
-    console.print(f"{study.measured} runs measured, {study.cached} from the cache", style="dim")
-
-
-def _narrow(table: Table, width: int) -> rich.table.Table:
-    """Three digits, and lines that a narrow terminal may break."""
-    rows = [[f"{cell:.3g}" if isinstance(cell, float) else cell for cell in row] for row in table.rows]
-    return replace(table, rows=rows).terminal(wrap=range(len(table.header)), width=width)
-
-
-def _paper_run(study: WorkStudy) -> list[TimedRun]:
-    """The full run of the paper's scene, where it was made."""
-    runs = [q.reference for q in study.questions.values() if isinstance(q.reference, TimedRun)]
-    return runs[:1] if paper_of(study.scene) == "forward" else []
-
-
 def _left_out(study: WorkStudy) -> list[tuple[str, str]]:
     """Questions without points, and the reason, each reason once."""
     names: dict[str, list[str]] = {}
@@ -175,7 +135,7 @@ def _left_out(study: WorkStudy) -> list[tuple[str, str]]:
 def _sections(study: WorkStudy, commands: list[dict[str, str]], figures: dict[str, Path]) -> list[Section]:
     """Parts of the page."""
     sections = [
-        Section("Answer", text="\n\n".join(answer.sentences), code="\n".join(lines.values()))
+        Section("Answer", "\n\n".join(answer.sentences), "\n".join(lines.values()), terminal=True)
         for answer, lines in zip(study.answers, commands, strict=True)
     ]
     truth = study.truth
@@ -183,9 +143,9 @@ def _sections(study: WorkStudy, commands: list[dict[str, str]], figures: dict[st
         rows = [(f"error estimate, {name}", f"{a:.1e} of the deformation, {b:.1e} of the displacement")
                 for name, (a, b) in truth.parts.items()]  # fmt: skip
         rows.append(("runs behind it", "; ".join(s.label for s in truth.settings)))
-        sections.append(Section("Reference", text=truth.note, rows=rows))
+        sections.append(Section("Reference", text=truth.note, rows=rows, terminal=True))
     for budget in study.error_budgets:
-        sections.append(budget_table(budget).section(budget.sentence))
+        sections.append(budget_table(budget).section(budget.sentence, terminal=True))
     answered = {name: question for name, question in study.questions.items() if question.points}
     feedback = [name for name in answered if name in CONTROL]
     if feedback and len(feedback) == len(answered):
@@ -196,11 +156,11 @@ def _sections(study: WorkStudy, commands: list[dict[str, str]], figures: dict[st
             sections.append(Section(f"{EQUATION} under feedback", equation=control_equation(study.scene)))
         drawn = [(figures[f"work_{name}"], CAPTIONS[name])] if f"work_{name}" in figures else []
         text = reference_text(question, paper_of(study.scene) == "control")
-        sections.append(question_table(name, question.points).section(text, TITLES[name], figures=drawn))
-    sections += [Section("Left out", text=f"{titles}: {reason}.") for titles, reason in _left_out(study)]
+        sections.append(question_table(name, question.points).section(text, TITLES[name], figures=drawn, terminal=True))
+    sections += [Section("Left out", f"{titles}: {reason}.", terminal=True) for titles, reason in _left_out(study)]
     if "work_budget" in figures:
         sections.append(Section("Budget", figures=[(figures["work_budget"], CAPTIONS["budget"])]))
-    sections.append(slope_table(study).section(title="Slopes"))
+    sections.append(slope_table(study).section(title="Slopes", terminal=True))
     return [*sections, Section("How it is measured", rows=_how(study))]
 
 
@@ -220,5 +180,7 @@ def _how(study: WorkStudy) -> list[tuple[Any, ...]]:
         ("front", "no other point is faster and more accurate"),
     ]
     if paper_of(study.scene) == "forward":
-        rows.append(("the paper", f"{PAPER_FULL} s full, {PAPER}, own machine"))
+        here = [q.reference for q in study.questions.values() if isinstance(q.reference, TimedRun)]
+        ours = f" ({here[0].seconds:.3g} s here)" if here else ""
+        rows.append(("the paper", f"{PAPER_FULL} s for the full run{ours}, {PAPER}, on its own machine"))
     return rows

@@ -176,7 +176,7 @@ def figure_reduced(points: Sequence[ReducedPoint], full: float, paper: bool, out
     lines = series_of(sorted(usable(points), key=lambda p: p.N))
     costs = {"seconds": "online time of a run [s]", "scratch": "time from nothing: full run, basis, online [s]"}
     with paper_style():
-        figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 3.7), sharey=True)
+        figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 3.7), sharey=True, layout="constrained")
         for ax, (x, label) in zip(axes, costs.items(), strict=True):
             for name, line in lines.items():
                 fill = "full" if look[name]["ls"] == "-" else "none"
@@ -188,9 +188,7 @@ def figure_reduced(points: Sequence[ReducedPoint], full: float, paper: bool, out
         handles = [_handle(titles[n], **look[n]) for n in names] + front + [_handle("full run", **FULL)]
         handles += _mark(axes[:1], paper, PAPER_REDUCED, f"paper, N = 14: {PAPER_REDUCED} s", ls=":")
         handles += _mark(axes[1:], paper, PAPER_FULL, f"paper, full: {PAPER_FULL} s")
-        rows = -(-len(handles) // 3)
-        figure.subplots_adjust(left=0.085, right=0.985, bottom=0.13, top=1 - (0.05 + 0.14 * rows) / 3.7, wspace=0.06)
-        figure.legend(handles=handles, loc="upper center", ncols=3, fontsize=6.5, borderaxespad=0.0)
+        figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=6.5)
         return save(figure, out_png)
 
 
@@ -206,7 +204,7 @@ def figure_series(points: Sequence[WorkPoint], x: str, y: str, out_png: Path) ->
                 _curve(ax, [p], ls="", marker=marker, ms=3.6, color=colour, mfc=colour if p.ok else "none")
         _curve(ax, pareto(points), label="Pareto front", **FRONT)
         _axes_log(ax, x, y)
-        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=6.5)
+        figure.legend(loc="outside right center", fontsize=6.5)
         return save(figure, out_png)
 
 

@@ -138,7 +138,7 @@ def ask_reduced(reduced: ReducedRuns) -> Question:
         SolverError: a solve or a factorisation failed.
     """
     section = reduced.scene.reduction
-    points = [p for name in chosen_methods(section) for p in reduced.points(name, section.N)]
+    points = [p for name in chosen_methods(reduced.scene) for p in reduced.points(name, section.N)]
     relations = ("error against N", "N", "error_outputs_full"), ("online seconds against N", "N", "seconds")
     return Question(tuple(points), slopes(points, *relations), reduced.timed)
 

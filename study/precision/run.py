@@ -193,7 +193,7 @@ def count_points(scene: Scene, control: ControlRuns, names: Sequence[str]) -> in
     d = control.layout.dimension
     counts = {
         "forward": sum(map(len, mesh_series(scene, d))) * len(SHARES) + len(solver_settings(scene)),
-        "reduced": 1 + len(chosen_methods(scene.reduction)),
+        "reduced": 1 + len(chosen_methods(scene)),
         "bases": 1 + len(ENGINES),
         "riccati": 1 + len(settings_of(control)),
         "reduced_riccati": 1 + len(BASES),

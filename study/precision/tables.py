@@ -13,7 +13,6 @@ from softgrasp.reduction.bases.registry import METHODS
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.precision.fit import Slope, pareto
 from softgrasp.study.precision.points import (
-    TITLES,
     BasisPoint,
     ForwardPoint,
     ReducedPoint,
@@ -80,16 +79,14 @@ COLUMNS: dict[str, dict[str, str | Callable[[Any], Any]]] = {
 }  # fmt: skip
 
 
-def question_table(name: str, points: Sequence[WorkPoint], front_only: bool = False) -> Table:
-    """Points of a question; what is not finite is a dash. The front alone needs no column that marks it."""
+def question_table(name: str, points: Sequence[WorkPoint]) -> Table:
+    """Points of a question; what is not finite is a dash."""
     front, columns = front_of(points), COLUMNS[name]
 
     def cells(p: WorkPoint) -> tuple[Any, ...]:
         row = [getattr(p, column) if isinstance(column, str) else column(p) for column in columns.values()]
         return tuple("-" if c is None or (isinstance(c, float) and not np.isfinite(c)) else c for c in row)
 
-    if front_only:
-        return Table(tuple(columns), [cells(p) for p in front], f"{TITLES[name]}, Pareto front")
     marks = ["*" if p in front else "" if p.ok else _why(p) for p in points]
     best = [i for i, p in enumerate(points) if p in front]
     rows = [(*cells(p), mark) for p, mark in zip(points, marks, strict=True)]

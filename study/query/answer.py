@@ -16,7 +16,7 @@ from softgrasp.reduction.certified.certificate import Certificate
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.motion import Materials
 from softgrasp.reduction.online import ReducedTrajectory
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report.tables import Table, percent
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class CertifiedAnswer:
             "--fallback full runs the full model, --allow shows the answer all the same" if self.run is None
             else "the full model ran instead" if self.full else "it is shown because --allow was given"
         )  # fmt: skip
-        return f"The error {c.claim(f'{c.reduction:.2g}')}, which is above the tolerance {c.tolerance:g}; {ending}."
+        return f"The error {c.claim(percent(c.reduction))}, which is above the tolerance {c.tolerance:g}; {ending}."
 
     @property
     def warnings(self) -> list[str]:

@@ -7,10 +7,10 @@ from typing import Any
 
 from softgrasp.reduction.certified.certificate import NORMS, Certificate
 from softgrasp.reduction.certified.model import ParameterDomain
-from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
-from softgrasp.study.report.files import write_json
-from softgrasp.study.report.page import Section, captioned, write_report
+from softgrasp.study.query.answer import CertifiedAnswer, QueryResult, answer_rows
+from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table, listed, percent
+from softgrasp.study.shell.session import Page, Session
 
 CAPTIONS = {
     "answer.png": "Outputs against the hand with the band that the error bound leaves (often thinner than the line); "
@@ -20,37 +20,48 @@ CAPTIONS = {
 }
 
 
-def write_page(out: Path, answers: QueryResult, line: str) -> list[Path]:
-    """Write result.json, the table, a figure and report.html, which ends in the command line."""
-    from softgrasp.study.query.plots import figure_answer, figure_batch  # brings Matplotlib
+def compose(answers: QueryResult, session: Session, options: str) -> Page:
+    """Draw the pictures, where a folder is written, and compose the page."""
+    model, many, first = answers.model, answers.many, answers.each[0]
+    shown = many or first.run is not None
+    drawn: list[Path] = []
+    if session.writes:
+        from softgrasp.study.query.plots import figure_answer, figure_batch  # brings Matplotlib
 
-    out.mkdir(parents=True, exist_ok=True)
-    model, many, first, table = answers.model, answers.many, answers.each[0], answers.parameter_table()
-    warnings = list(dict.fromkeys(x for a in answers.each for x in (a.certificate.reasons if many else a.warnings)))
-    result: dict[str, Any] = {
-        "command": "query", "scene": model.fine.name, "model": str(answers.path), "warnings": warnings,
-        "answers": [dict(zip(table.header, row, strict=True)) for row in table.rows],
+        drawn += figure_batch(answers, session.out / "answers.png") if many else figure_answer(first, session.out)
+    figures, notes = captioned(drawn, CAPTIONS), warnings(answers)
+    if many:
+        parts = [answers.parameter_table().section(figures=figures, terminal=True)]
+    else:
+        parts = [Section("", figures=figures)]
+        parts += [Section("Answer", rows=answer_rows(first), terminal=True)] if shown else []
+        parts += [error_table(first.certificate).section()]
+        parts += [output_table(first).section()] if shown else []
+    about = [("modes of the answer, of the proof", f"{model.k}, {model.k2}")]
+    about += [("trained for", box_text(model.box))] if model.box is not None else []
+    about += [("built for an error of", f"{model.tolerance:g}")] if model.tolerance is not None else []
+    tables = {("answers.csv" if many else "answer.csv"): answers.table()} if shown else {}
+    error, *summary = _summary_batch(answers) if many else _summary(first, answers.seconds)
+    return Page(
+        "Answer of a certified model", summary, [*parts, Section("Model", rows=about)], tables, drawn, options,
+        errors=[error], warnings=notes,
+    )  # fmt: skip
+
+
+def warnings(answers: QueryResult) -> list[str]:
+    """What a user should know of the answers, in sentences."""
+    each = answers.each
+    return list(dict.fromkeys(x for a in each for x in (a.certificate.reasons if answers.many else a.warnings)))
+
+
+def result_of(answers: QueryResult) -> dict[str, Any]:
+    """The keys of ``result.json``."""
+    table = answers.parameter_table()
+    return {
+        "command": "query", "scene": answers.model.fine.name, "model": str(answers.path),
+        "warnings": warnings(answers), "answers": [dict(zip(table.header, row, strict=True)) for row in table.rows],
         "time": {"query": answers.seconds},
     }  # fmt: skip
-    files = [write_json(out / "result.json", result)]
-    if many or first.run is not None:
-        files.append(answers.table().write_csv(out / ("answers.csv" if many else "answer.csv")))
-    drawn = figure_batch(answers, out / "answers.png") if many else figure_answer(first, out)
-    files += drawn
-    figures = captioned(drawn, CAPTIONS)
-    sections = [(table if many else error_table(first.certificate)).section(figures=figures)]
-    sections += [Section("Warnings", text="\n\n".join(warnings))] if warnings else []
-    sections += [] if many or first.run is None else [output_table(first).section()]
-    box, limit = model.box, model.tolerance
-    about = [("modes of the answer, of the proof", f"{model.k}, {model.k2}")]
-    about += [("trained for", box_text(box))] if box is not None else []
-    about += [("built for an error of", f"{limit:g}")] if limit is not None else []
-    page = write_report(
-        out / "report.html", title="Answer of a certified model", subtitle=str(answers.path),
-        summary=_summary_batch(answers) if many else _summary(first, answers.seconds),
-        sections=[*sections, Section("Model", rows=about)], result=result, reproduce=line, files=files,
-    )  # fmt: skip
-    return [*files, page]
 
 
 def box_text(box: ParameterDomain) -> str:
@@ -83,20 +94,21 @@ def _summary(answer: CertifiedAnswer, seconds: float) -> list[str]:
     error = f"The error of the reduction {c.claim(percent(c.reduction))}"
     error += f"; {listed(off)}, by estimates." if off else "; those of time step and mesh are not known."
     if answer.run is None:
-        return [f"{at} the certified model refuses to answer.", error, answer.refusal]
+        return [error, f"{at} the certified model refuses to answer."]
     ends = listed([f"{name} at {end:.4g} m" for name, end, *_ in answer.outputs()])
     took = "" if answer.full else f", in {1e3 * seconds:.3g} ms with its error"
-    last = answer.warnings[:1] or [f"This is within the tolerance {c.tolerance:g}."] * (c.tolerance is not None)
-    return [f"{at} the {answer.source} ends with {ends}{took}.", error, *last]
+    within = [] if answer.warnings or c.tolerance is None else [f"This is within the tolerance {c.tolerance:g}."]
+    return [error, f"{at} the {answer.source} ends with {ends}{took}.", *within]
 
 
 def _summary_batch(answers: QueryResult) -> list[str]:
     refused, full, outside = answers.counts
     worst = answers.each[answers.worst[0]]
+    where = f"Outside the box of the training: {outside}; the bound holds there too."
     return [
-        f"The reduced model answers {len(answers.each) - refused - full} of {len(answers.each)} materials, in "
-        f"{1e3 * answers.seconds:.3g} ms; the full model answers {full}, {refused} are refused.",
         f"The largest error of the reduction {worst.certificate.claim(percent(worst.certificate.reduction))}, "
         f"at {worst.parameters}.",
-        f"Outside the box of the training: {outside}; the bound holds there too.",
+        f"The reduced model answers {len(answers.each) - refused - full} of {len(answers.each)} materials, in "
+        f"{1e3 * answers.seconds:.3g} ms; the full model answers {full}, {refused} are refused.",
+        *([where] if outside else []),
     ]

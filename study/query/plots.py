@@ -42,7 +42,7 @@ def figure_answer(answer: CertifiedAnswer, out: Path) -> tuple[Path, ...]:
                     about = np.maximum(np.maximum.accumulate(c.outputs_estimate.values[1:, i]), LEAST)
                     below.semilogy(run.times[1:], about, color=colour, ls=":", label="estimated")
             top.set_ylabel(f"relative to hand [{unit}]")
-            top.legend(ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
+            figure.legend(*top.get_legend_handles_labels(), loc="outside upper left", ncols=3)
             largest = float(c.outputs.values.max(initial=LEAST))
             below.set(xlabel="time [s]", ylabel="largest error so far [m]", ylim=(1e-4 * largest, 2 * largest))
             below.legend(handles=below.lines[:2], loc="lower right")

@@ -12,10 +12,10 @@ import h5py
 from mpi4py import MPI
 from rich.console import Console
 
+from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.errors import SceneError, raise_on_all_ranks
 from softgrasp.fem.mesh.scene_hash import scene_keys
 from softgrasp.fem.model.build import Model, Stopwatch, build
-from softgrasp.fem.owned import follow
 from softgrasp.fem.petsc import on_root
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.trajectory import Trajectory
@@ -24,16 +24,13 @@ from softgrasp.reduction.certified.archive import load_certified
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.motion import Drive, Materials
 from softgrasp.reduction.origin import MATERIAL, UNKNOWN, differing, origin_of
-from softgrasp.study.query.answer import CertifiedAnswer, QueryResult, answer_rows
-from softgrasp.study.query.page import box_text, write_page
+from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
+from softgrasp.study.query.page import box_text, compose, result_of
 from softgrasp.study.query.request import drive_of, materials_of, parse_settings, read_batch
-from softgrasp.study.report.origin import command_line
-from softgrasp.study.report.tables import pairs
-from softgrasp.study.shell.folder import claim, folder_lock
-from softgrasp.study.shell.session import list_files, show_warnings
+from softgrasp.study.shell.folder import folder_lock
+from softgrasp.study.shell.session import Session, list_files, show_warnings
 
 REFUSED = 3  # exit status
-SHOWN = 20  # lines of a batch in the terminal
 
 
 @folder_lock()
@@ -86,12 +83,8 @@ def run_query(
     many = [materials_of(model, setting) for setting in questions]
     with raise_on_all_ranks(MPI.COMM_WORLD):  # free memory and files differ between machines
         drive = drive_of(model, motion, dt, len(many))
-    with raise_on_all_ranks(MPI.COMM_WORLD):
-        if folder is not None and MPI.COMM_WORLD.rank == 0:
-            read = [file for file in (path, motion, scene, batch) if file is not None]
-            claim(folder, "query", model.fine.name, inputs=read, empty=empty)
-    if folder is not None:
-        follow(folder)
+    session = Session("query", path, settings, folder or Path(), console, empty=empty, writes=folder is not None)
+    session.claim(model.fine.name, lambda: [file for file in (path, motion, scene, batch) if file is not None])
     modes = f"{model.k} modes" + (f", certified by {model.k2}" if model.k < model.k2 else "")
     trained = "" if model.box is None else f", trained for {box_text(model.box)}"
     limit = "" if model.tolerance is None else f", tolerance {model.tolerance:g}"
@@ -109,48 +102,16 @@ def run_query(
         full = _full_model(console, model, path, scene, motion, drive)
         each = [replace(a, run=_full_run(full, a.materials)) if a.run is None else a for a in each]
     answers = QueryResult(path, model, each, seconds, batch is not None)
-    _show(console, answers)
+    given = {"motion": motion, "dt": dt, "tolerance": tolerance, "fallback": fallback, "batch": batch}
+    options = [f"--{key} {shlex.quote(str(value))}" for key, value in given.items() if value is not None]
+    words = "".join(f" {option}" for option in [*options, *["--allow"] * allow, f"--out {folder}"])
+    session.write(None, result_of(answers), lambda: compose(answers, session, words), clock=False)
     if out is not None and any(answer.run is not None for answer in each):
         with raise_on_all_ranks(MPI.COMM_WORLD):
             if MPI.COMM_WORLD.rank == 0:
                 answers.table().write_csv(out)
         list_files(console, [out])
-    if folder is not None:
-        with raise_on_all_ranks(MPI.COMM_WORLD):
-            if MPI.COMM_WORLD.rank == 0:
-                given = {"motion": motion, "dt": dt, "tolerance": tolerance, "fallback": fallback, "batch": batch}
-                options = [f"--{key} {shlex.quote(str(value))}" for key, value in given.items() if value is not None]
-                words = "".join(f" {option}" for option in [*options, *["--allow"] * allow, f"--out {folder}"])
-                line = command_line("query", path, settings, MPI.COMM_WORLD.size, words)
-                list_files(console, write_page(folder, answers, line))
     return REFUSED if answers.counts[0] else 0
-
-
-def _show(console: Console, answers: QueryResult) -> None:
-    took = f"{1e3 * answers.seconds:.3g} ms"
-    if not answers.many:
-        (answer,) = answers.each
-        if answer.run is None:
-            console.print(f"refused: {answer.refusal}", style="red", soft_wrap=True, markup=False)
-        else:
-            console.print(pairs([*answer_rows(answer), ("time of the reduced answer", took)]))
-        show_warnings(console, answer.warnings[answer.run is None :])
-        return
-    rows = [
-        (f"lambda = {a.materials[0].lam:g}, mu = {a.materials[0].mu:g} Pa",
-         f"{a.source}, error at most {a.certificate.reduction:.2g}")
-        for a in answers.each
-    ]  # fmt: skip
-    console.print(pairs(rows[:SHOWN]))
-    if len(rows) > SHOWN:
-        console.print(f"... and {len(rows) - SHOWN} more")
-    refused, full, outside = answers.counts
-    text = f"{len(rows)} parameters in {took}"
-    text += f", {refused} refused" * bool(refused) + f", {full} by the full model" * bool(full)
-    console.print(text, soft_wrap=True)
-    if outside:
-        lie = "1 parameter lies" if outside == 1 else f"{outside} parameters lie"
-        show_warnings(console, [f"{lie} outside the box of the training; the bound holds all the same"])
 
 
 def _full_model(
@@ -175,7 +136,11 @@ def _full_model(
         kind = "motion" if drive.force is None else "force"
         table = {"profile": "csv", "csv": str(motion.absolute()), "drive": kind}
         overrides.append(f"motion={toml_value(table)}")
-    full = build(load_scene_collective(MPI.COMM_WORLD, scene, overrides), comm=MPI.COMM_WORLD)
+    # other steps and motions may need another mesh: the model is of that of its own scene
+    own = load_scene_collective(MPI.COMM_WORLD, scene)
+    tolerant = own.tissue.refine is not None and own.tissue.refine.tolerance is not None
+    mesh = adapt.adapted_mesh(adapt.build(own, comm=MPI.COMM_WORLD, steps=False)) if tolerant else None
+    full = build(load_scene_collective(MPI.COMM_WORLD, scene, overrides), comm=MPI.COMM_WORLD, mesh=mesh)
     load_certified(path, full.system.layout)  # refuses another mesh
     return full
 

@@ -22,7 +22,7 @@ def check_scene(scene: Scene) -> tuple[str, ...]:
             f"output.snapshots is '{scene.output.snapshots}'; it must be 'memory' for a reduction, which builds its "
             "bases from the states in memory"
         )
-    return measure.chosen_methods(scene.reduction)
+    return measure.chosen_methods(scene)
 
 
 @folder_lock()

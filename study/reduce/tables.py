@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import math
-
-import numpy as np
+from typing import Any
 
 from softgrasp.study.reduce.times import FullTimes, Timed
-
-# headings: time of a run, of set-up and run at a new parameter, and offline; speed-ups; runs until offline has paid
-TIMES = ("run [ms]", "new [ms]", "offline [s]", "x again", "x new", "break-even")
+from softgrasp.study.report.tables import Columns
 
 
-def short(value: float | None, digits: int = 2) -> str:
-    """A number for a narrow column; "overflow" where it is not finite, "-" where there is none."""
-    if value is None:
-        return "-"
-    return f"{value:.{digits}g}" if np.isfinite(value) else "overflow"
+def timed(p: Timed, full: FullTimes, **more: Any) -> dict[str, Any]:
+    """A row below :data:`TIMES`: a reduced model with the times ``p`` beside the full model."""
+    return {"p": p, "up": full.against(p), **more}
 
 
-def time_cells(p: Timed, full: FullTimes) -> tuple[str, ...]:
-    """Cells below :data:`TIMES` of a reduced model with the times ``p`` beside the full model."""
-    up = full.against(p)
-    runs = "never" if up.break_even_runs is None else str(math.ceil(up.break_even_runs))
-    seconds = f"{1e3 * p.time_online:.2f}", f"{1e3 * (p.time_setup + p.time_online):.2f}", f"{p.time_offline:.2f}"
-    return *seconds, short(up.again, 3), short(up.new, 3), runs
+TIMES: Columns = {
+    "run [ms]": lambda r: f"{1e3 * r['p'].time_online:.2f}",
+    "new [ms]": lambda r: f"{1e3 * (r['p'].time_setup + r['p'].time_online):.2f}",
+    "offline [s]": "p.time_offline .2f",
+    "x again": "up.again .3g",
+    "x new": "up.new .3g",
+    "break-even": lambda r: "never" if (runs := r["up"].break_even_runs) is None else str(math.ceil(runs)),
+}
+"""Time of a run, of set-up and run at a new parameter, and offline; speed-ups; runs until offline has paid."""

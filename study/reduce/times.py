@@ -14,6 +14,7 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.reduction.replay import FullRun, full_run
+from softgrasp.study.report.tables import percent
 from softgrasp.study.shell.timing import RepeatableRun, processor_seconds
 
 FULL_REPEATS = 3  # behind the median of the full run
@@ -95,7 +96,7 @@ class Turns:
 
     def sentence(self, own: float, others: str) -> str:
         """The headline: speed and error in one sentence, or that there is none. ``others``: error at new materials."""
-        error = f"error {own:.2%} at the scene's parameter, {others}"
+        error = f"error {percent(own)} at the scene's parameter, {others}"
         how = f"quartiles of {self.rounds} rounds, processor time of both in turn"
         if self.steady:
             again = f"{self.again} times as fast as the full model, {self.new} at a new parameter"

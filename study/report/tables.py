@@ -94,7 +94,7 @@ def entry(row: Any, path: str) -> Any:
 def table_of(rows: Sequence[Any], columns: Columns, title: str = "") -> Table:
     """One line a row: for each heading a function of the row, or the entry at a path, formatted ``drift .0e``.
 
-    The format 3 is that of :func:`number`; without one the entry stands as it is.
+    The format 3 is that of :func:`number`, % that of :func:`percent`; without one the entry stands as it is.
     """
 
     def cell(row: Any, column: str | Callable[[Any], Any]) -> Any:
@@ -104,7 +104,7 @@ def table_of(rows: Sequence[Any], columns: Columns, title: str = "") -> Table:
         value = entry(row, path)
         if not form or value is None:
             return value if not form else number(None)
-        return number(value) if form == "3" else f"{value:{form}}"
+        return {"3": number, "%": percent}[form](value) if form in ("3", "%") else f"{value:{form}}"
 
     return Table(tuple(columns), [[cell(row, column) for column in columns.values()] for row in rows], title)
 
@@ -157,9 +157,11 @@ def numeric(cell: Any) -> bool:
     """A number, the text of one with its unit, or an empty cell."""
     if cell is None or cell in ("", "-") or (isinstance(cell, NUMBERS) and not isinstance(cell, bool)):
         return True
-    return re.fullmatch(r"[<~]? ?[-+]?[\d.]+(e[-+]?\d+)?( ?%| [a-zA-Zµ/]{1,4})?( ?!)?", str(cell)) is not None
+    return re.fullmatch(r"[<>~]? ?[-+]?[\d.]+(e[-+]?\d+)?( ?%| [a-zA-Zµ/]{1,4})?( ?!)?", str(cell)) is not None
 
 
 def percent(share: float) -> str:
-    """A share as a percentage of two digits."""
+    """A share as a percentage of two digits; "> 9999 %" also where it is not finite."""
+    if not share < 100:
+        return "> 9999 %"
     return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"

@@ -9,7 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.owned import LIST, LOCK, begin_list, forget, hold, own_files, read_list, release, remove_own
+from softgrasp.fem.owned import (
+    LIST,
+    LOCK,
+    begin_list,
+    forget,
+    hold,
+    own_files,
+    read_list,
+    release,
+    remove_own,
+    set_aside,
+)
 from softgrasp.fem.scene.text import read_text
 
 
@@ -44,11 +55,12 @@ def remove_files(folder: Path, names: Iterable[str]) -> None:
 
 @contextmanager
 def folder_lock() -> Iterator[None]:
-    """Decorates a command: the folder that it claims is given back at its end, however it ends."""
-    try:
+    """Decorates a command: the folder that it claims is given back at its end, however it ends.
+
+    Where another command called it, that one goes on with its own folder.
+    """
+    with set_aside():
         yield
-    finally:
-        release()
 
 
 def claim(out: Path, command: str, scene: str, *, inputs: Iterable[Path] = (), empty: bool = False) -> None:

@@ -28,7 +28,9 @@ SIDES = {2: ["left", "right", "bottom", "top", "x-", "x+", "y-", "y+"], 3: ["lef
 MOST_DENSE = 260  # unknowns of a linear run that is repeated with dense matrices
 DRIFT = 1e-9  # of the energy in a direct linear run: rounding, of materials up to nu = 0.499
 DENSE = 1e-6  # a run against the same with dense matrices: rounding
-ITERATED = 1e-5  # the same of cg, which stops at 1e-8 of its residual: seen up to 9e-7, of layers of very unlike nu
+# The same of iterations: cg stops at 1e-8 of its residual, seen up to 9e-7, of layers of very unlike nu; stars at 1e-4,
+# and warns where it estimates more than 1e-3, within a factor 3.
+ITERATED = {"cg": 1e-5, "stars": 3e-3}
 
 
 def pick(rng: Rng, *choices: Any) -> Any:
@@ -89,6 +91,8 @@ def random_scene(rng: Rng, folder: Path) -> dict[str, Any]:
     if rng.random() < 0.1:
         scene["hand"]["reference"] = (low + np.array(size) * rng.uniform(-1, 2, d)).round(3).tolist()
     scene |= _motion_and_time(rng, d, n_s, effects, size, folder)
+    if order > 1 and scene["time"]["solver"] == "cg" and scene["time"]["steps"] in (5, 25):
+        scene["time"]["solver"] = "stars"
     if rng.random() < 0.5:
         scene["control"] = {"outputs": [_output(rng, low, np.array(size)) for _ in range(pick(rng, 1, 1, 2, 3))]}
     output: dict[str, Any] = {
@@ -241,7 +245,8 @@ def check_answer(file: Path, out: Path) -> None:
     assert np.isfinite(table[:, ~force]).all(), "a trajectory that is not finite"
     assert np.isfinite(table[1:]).all(), "a force that is not finite"
     scene = load_scene(file)
-    direct = result["solver"]["name"] != "cg" and scene.effects.finite_strain is None
+    solver = result["solver"]["name"]
+    direct = solver not in ITERATED and scene.effects.finite_strain is None
     told = any("digit" in text for text in result["warnings"])
     if direct and not told:
         assert abs(result["energy_drift"]) < DRIFT, f"energy drift {result['energy_drift']:.1e} without a word"
@@ -249,7 +254,7 @@ def check_answer(file: Path, out: Path) -> None:
         error = result["mesh_error"]
         assert 0 <= error["estimate"] <= error["bound"] * (1 + 1e-12), "an estimate above its bound"
     if scene.effects.finite_strain is None and result["n_e"] <= MOST_DENSE and scene.tissue.refine is None and not told:
-        compare(build(scene), table, DENSE if direct else ITERATED)
+        compare(build(scene), table, DENSE if direct else ITERATED[solver])
 
 
 def compare(model: Model, table: Any, limit: float) -> None:

@@ -11,7 +11,7 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.reduction.errors import ModelComparison, full_energy
+from softgrasp.reduction.errors import VIEWS, ModelComparison, Span, full_energy
 from softgrasp.reduction.online import run
 from softgrasp.reduction.replay import full_run, replay_linear
 from softgrasp.reduction.system import ModelError
@@ -115,3 +115,29 @@ def test_a_pushed_model_repeats_a_led_run_of_which_few_states_are_kept(comm: MPI
     # rounding of 30 steps in other coordinates
     assert close(again.v_s, full.trajectory.v_s) < 1e-9
     assert close(again.outputs - again.q_s, full.trajectory.outputs - full.trajectory.q_s) < 1e-9
+
+
+def test_what_a_model_shows_is_put_into_the_span_once(comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors and least errors of one model take three views, and the numbers of another model are its own."""
+    model = model_of(comm)
+    snapshots: Any = simulate(model).snapshots
+    layout, energy = model.system.layout, full_energy(model.system, snapshots.Z)
+    large = symplectic_basis(layout, 5, "relative", True)
+    roms = [reduced(model, leading(large, k)) for k in (3, 5)]
+    comparison = ModelComparison(roms[1], roms[1].at(), model.system, snapshots, energy)
+    calls: list[int] = []
+    inside = Span.inside
+    monkeypatch.setattr(Span, "inside", lambda self, V: calls.append(V.shape[1]) or inside(self, V))
+    for rom in roms:
+        small = rom.at()
+        own = run(small, step_of(model), force_of(model), allow_unstable=True)
+        alone = ModelComparison(rom, small, model.system, snapshots, energy)
+        for fresh, each in ((True, alone), (False, comparison)):
+            calls.clear()
+            found = each.errors(rom, small, own)
+            least = [each.projection_error(view, rom, small) for view in VIEWS]
+            assert len(calls) == 3
+            if fresh:
+                expected = found, least
+        assert found.error == pytest.approx(expected[0].error, rel=1e-10)  # sums in another order
+        assert least == pytest.approx(expected[1], rel=1e-8)  # least squares, condition 1e4

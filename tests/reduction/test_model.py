@@ -12,12 +12,15 @@ import pytest
 import scipy.linalg
 from mpi4py import MPI
 
+import softgrasp as sg
+from softgrasp.fem.errors import SceneError
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.reduction.archive import load, save, write_checksums
-from softgrasp.reduction.bases.basis import Basis
+from softgrasp.reduction.bases.basis import Basis, ReductionError
+from softgrasp.reduction.bases.states import BasisError
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
@@ -394,3 +397,24 @@ def test_files_of_earlier_versions_are_read(comm: MPI.Intracomm, mpi_tmp_path: P
     comm.Barrier()
     with pytest.raises(ModelError, match="damaged"):
         load(file, model.system.layout)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("N", [[], 3.5, "a", True, (14,), float("nan")])
+def test_what_is_no_dimension_is_refused_in_one_sentence(N: object) -> None:
+    model = sg.build("paper_forward", ["tissue.cells=[2, 4]", "time.steps=12"])
+    run = sg.simulate(model)
+    with pytest.raises(BasisError, match=r"^N = .* is no dimension; give a whole number, a Truncation or None$"):
+        sg.reduce(model, run, N=N)  # type: ignore[arg-type]
+    with pytest.raises(ReductionError, match=r"^3 is no run; give what softgrasp\.simulate returns"):
+        sg.reduce(model, 3)  # type: ignore[arg-type]
+    assert sg.reduce(model, run, N=np.int64(8)).N == 8  # a whole number of NumPy
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("given", "words"), [({"lam": "a"}, "lam = 'a' must"), ({"mu": [1]}, r"mu = \[1\] must"), ({"young": "x"}, "young")]
+)
+def test_materials_that_are_no_numbers_are_refused_in_one_sentence(given: dict[str, Any], words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        sg.build("paper_forward", ["tissue.cells=[2, 4]"]).with_materials(**given)

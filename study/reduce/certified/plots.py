@@ -11,8 +11,9 @@ from matplotlib.colors import LogNorm
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, UNSTABLE, WIDTH, few_ticks, paper_style, save
+from softgrasp.study.pictures.style import BLUE, COLUMN, GREEN, HAND, ORANGE, UNSTABLE, few_ticks, paper_style, save
 from softgrasp.study.reduce.certified.result import BoxCheck, Size
+from softgrasp.study.report.tables import percent
 
 KINDS = (
     ("bound", "bound (proved)", BLUE, "o"),
@@ -39,21 +40,20 @@ def figure_box(own: Size, out_png: Path) -> tuple[Path, ...]:
     whole = np.concatenate([v[np.isfinite(v)] for v in values.values()])
     norm = LogNorm(max(float(whole.min()), LEAST) / 1.1, max(float(whole.max()), 10 * LEAST) * 1.1)
     with paper_style():
-        figure, axes = plt.subplots(
-            1, len(shown), figsize=(WIDTH, 2.6), squeeze=False, sharey=True, layout="constrained"
-        )
+        size = (COLUMN + 0.4, 0.3 + 2.2 * len(shown))
+        figure, axes = plt.subplots(len(shown), 1, figsize=size, squeeze=False, sharex=True, layout="constrained")
         picture: Any = None
-        for ax, (key, title, *_) in zip(axes[0], shown, strict=True):
+        for ax, (key, title, *_) in zip(axes[:, 0], shown, strict=True):
             colours = np.maximum(values[key], LEAST)
             picture = ax.scatter(lam, mu, s=190, marker="s", norm=norm, cmap="viridis_r", c=colours)
-            span = f"{np.nanmin(values[key]):.1e} to {np.nanmax(values[key]):.1e}"
-            ax.set(xscale="log", yscale="log", xlabel="λ [Pa]", title=f"{title}\n{span}")
+            span = f"{percent(np.nanmin(values[key]))} to {percent(np.nanmax(values[key]))}"
+            ax.set(xscale="log", yscale="log", ylabel="μ [Pa]", title=f"{title}: {span}")
             ax.margins(0.14)
             for axis, places in ((ax.xaxis, lam), (ax.yaxis, mu)):
                 axis.set_ticks(sorted(set(places)), [f"{x:.3g}" for x in sorted(set(places))])
                 axis.set_ticks([], minor=True)
-        axes[0, 0].set_ylabel("μ [Pa]")
-        bar = figure.colorbar(picture, ax=axes[0].tolist(), label="relative error")
+        axes[-1, 0].set_xlabel("λ [Pa]")
+        bar = figure.colorbar(picture, ax=axes[:, 0].tolist(), label="relative error [1]")
         few_ticks(bar.ax.yaxis)
         return save(figure, out_png)
 
@@ -63,7 +63,7 @@ def figure_greedy(certified: CertifiedModel, tolerance: float, out_png: Path) ->
     rounds, box = certified.training["rounds"], certified.box
     k, bound = [r["k"] for r in rounds], np.array([r["bound"] for r in rounds], dtype=float)
     with paper_style():
-        figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH, 2.7), layout="constrained")
+        figure, (left, right) = plt.subplots(2, 1, figsize=(COLUMN + 0.9, 5.4), layout="constrained")
         known = np.isfinite(bound)
         shown = np.maximum([*bound[known], tolerance], LEAST)  # a bound of 0, where nothing moves, has no logarithm
         # limits first: there may be nothing to scale by
@@ -77,7 +77,7 @@ def figure_greedy(certified: CertifiedModel, tolerance: float, out_png: Path) ->
         left.set(xlabel="modes k", ylabel="relative bound")
         left.grid(axis="y", color="#e6e6e6", lw=0.5)
         few_ticks(left.yaxis)
-        left.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0))
+        left.legend()
         places: dict[tuple[float, float], list[int]] = {}
         for i, (lam, mu) in enumerate(certified.training["chosen"], 1):
             places.setdefault((float(lam), float(mu)), []).append(i)
@@ -98,7 +98,7 @@ def figure_greedy(certified: CertifiedModel, tolerance: float, out_png: Path) ->
 def figure_sizes(check: BoxCheck, tolerance: float, out_png: Path) -> tuple[Path, ...]:
     """Effectivities of every size, and errors against the time of an answer."""
     with paper_style():
-        figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH, 2.8), layout="constrained")
+        figure, (left, right) = plt.subplots(2, 1, figsize=(COLUMN + 0.9, 5.6), layout="constrained")
         for size in check.sizes:
             values = np.array([t.effectivity for t in size.tested])
             values = values[np.isfinite(values)]
@@ -126,5 +126,5 @@ def figure_sizes(check: BoxCheck, tolerance: float, out_png: Path) -> tuple[Path
         right.grid(axis="y", color="#e6e6e6", lw=0.5)
         few_ticks(right.xaxis)
         right.yaxis.set_minor_formatter(NullFormatter())
-        right.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+        right.legend()
         return save(figure, out_png)

@@ -31,10 +31,9 @@ from softgrasp.reduction.certified.trainer import (
 from softgrasp.reduction.parameters import run_at
 from softgrasp.reduction.system import ModelError
 from softgrasp.study.reduce.certified.measure import REPEATS, check_box
-from softgrasp.study.reduce.certified.report import CAPTIONS, greedy_table, sentences, shown, tests_table
+from softgrasp.study.reduce.certified.page import compose, shown
 from softgrasp.study.reduce.certified.result import BoxCheck
 from softgrasp.study.reduce.result import reduce_result
-from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.shell.session import Page, Session
 from softgrasp.study.shell.timing import median_seconds
 
@@ -71,7 +70,6 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
     with watch.stage("tests"):
         check = check_box(model, certified)
     result = certify_result(model, certified, check, watch)
-    lines = [*sentences(certified, check, result), *([unknown] if unknown else [])]
 
     def page() -> Page:
         drawn: list[Path] = []
@@ -79,16 +77,8 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
             from softgrasp.study.reduce.certified.plots import draw  # brings Matplotlib
 
             drawn = draw(session.out, certified, check, tolerance)
-        greedy = greedy_table(certified)
-        parts = [
-            Section("What holds", text="\n\n".join(lines), figures=captioned(drawn, CAPTIONS)),
-            greedy.section("Each round runs the full model where the proved bound was largest."),
-        ]
-        tables = {"greedy.csv": greedy} | ({} if check is None else {"tests.csv": tests_table(check)})
-        return Page(f"{scene.name}: certified reduced model", lines[:3], parts, tables, [*drawn, file])
+        return compose(certified, check, result, unknown, drawn, file)
 
-    for sentence in lines:
-        console.print(sentence, markup=False)
     session.write(scene, result, page)
     return result
 

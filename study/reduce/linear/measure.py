@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.scene.control import Reduction
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.bases import registry
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.bases.states import BasisError, States, states_of
@@ -49,9 +50,18 @@ Progress = Callable[[int, int], None]
 """Called with what is done and what there is."""
 
 
-def chosen_methods(options: Reduction) -> tuple[str, ...]:
-    """Methods of the scene, or the paper's six and further ones. Raises BasisError: a name is unknown."""
-    names = tuple(options.methods) or (*registry.PAPER_METHODS, *FURTHER)
+def chosen_methods(scene: Scene) -> tuple[str, ...]:
+    """Methods of the scene, or the paper's six, further ones and the scene's own. Collective.
+
+    Raises BasisError: a name is unknown, or a file of ``reduction.plugins`` does not give a basis.
+    """
+    options: Reduction = scene.reduction
+    own: tuple[str, ...] = ()
+    if options.plugins:
+        from softgrasp.reduction.bases.plugins import load_plugins  # only scenes with bases of their own pay for it
+
+        own = load_plugins([scene.path(file) for file in options.plugins])
+    names = tuple(options.methods) or (*registry.PAPER_METHODS, *FURTHER, *own)
     for name in names:
         registry.find_method(name)
     return names
@@ -176,10 +186,27 @@ def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | No
     return models
 
 
-def errors_at(full: FullRun, models: Sequence[TestedModel]) -> tuple[float, ...]:
-    """Deformation errors of all models at the parameter of one full run, without any new projection. Collective."""
+Family = tuple[str, bool]
+"""Key of a method, and whether several runs trained it."""
+
+
+def families(full: FullRun, models: Sequence[TestedModel]) -> dict[Family, ModelComparison]:
+    """What the errors of all models are computed from. Collective."""
     largest = {(m.method.key, m.several): m.model for m in sorted(models, key=lambda m: m.model.N)}
-    comparisons = {family: comparison_of(model, full) for family, model in largest.items()}
+    return {family: comparison_of(model, full) for family, model in largest.items()}
+
+
+def moved(known: dict[Family, ModelComparison], full: FullRun) -> dict[Family, ModelComparison]:
+    """The same at the materials of another run, of the same densities. Collective."""
+    system = full.model.system
+    places = {family: each.model.at(system.materials) for family, each in known.items()}
+    return {f: each.at(places[f], system, full.snapshots, full.energy) for f, each in known.items()}
+
+
+def errors_at(
+    full: FullRun, models: Sequence[TestedModel], comparisons: dict[Family, ModelComparison]
+) -> tuple[float, ...]:
+    """Deformation errors of all models at the parameter of one full run, without any new projection. Collective."""
     errors = []
     for m in models:
         with np.errstate(all="ignore"):  # may be unstable away from the training parameter
@@ -200,12 +227,14 @@ def measure_box(
     first, training, grid = scene.system.materials[0], training_of(scene), grid_of(scene)
     models = box_models(full, sweeps, training_states(full, training) if training else None)
     trained_at = ((first.lam, first.mu), *training)
-    points = []
+    known = families(full, models)
+    own, points = errors_at(full, models, known), []
     for k, (lam, mu) in enumerate(grid):
         progress(k, len(grid))
         trained = any(np.allclose((lam, mu), place) for place in trained_at)
-        points.append(BoxPoint(lam, mu, trained, errors_at(run_at(scene, lam, mu), models)))
-    own, tests, summary = errors_at(full, models), [p for p in points if not p.trained] or points, []
+        place = run_at(scene, lam, mu)
+        points.append(BoxPoint(lam, mu, trained, errors_at(place, models, moved(known, place))))
+    tests, summary = [p for p in points if not p.trained] or points, []
     for i, m in enumerate(models):
         errors = [p.errors[i] for p in tests]
         runs = len(trained_at) if m.several else int(m.method.snapshots)

@@ -100,9 +100,7 @@ def figure_errors(
     single, look = len(quantities) == 1, looks(s.method.key for s in sweeps)
     with style.paper_style():
         size = (style.COLUMN + 1.6, 3.4 if single else 6.4)
-        figure, axes = plt.subplots(len(quantities), 1, figsize=size, sharex=True, squeeze=False)
-        bottom, top = (0.13, 0.9) if single else (0.07, 0.97)
-        figure.subplots_adjust(left=0.13, right=0.66, bottom=bottom, top=top, hspace=0.1)
+        figure, axes = plt.subplots(len(quantities), 1, figsize=size, sharex=True, squeeze=False, layout="constrained")
         for ax, (key, label) in zip(axes[:, 0], quantities, strict=True):
             ends = []
             for s in sweeps:
@@ -120,7 +118,7 @@ def figure_errors(
             style.direct_labels(ax, ends)
         axes[-1, 0].set_xlabel("N, columns of the basis")
         if single and (handles := _remarks(sweeps)):
-            ax.legend(handles=handles, loc="lower left", bbox_to_anchor=(-0.1, 1.0), borderaxespad=0.2, ncols=2)
+            figure.legend(handles=handles, loc="outside upper left", ncols=2)
         return style.save(figure, out_png)
 
 
@@ -167,9 +165,9 @@ def figure_sigma(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ..
     if not groups:
         return ()
     with style.paper_style():
-        size = (style.WIDTH if len(groups) > 1 else 0.6 * style.WIDTH, 3.3)
-        figure, axes = plt.subplots(1, len(groups), figsize=size, sharey=True, squeeze=False, layout="constrained")
-        for ax, group in zip(axes[0], groups, strict=True):
+        size = (style.COLUMN + 0.9, 0.3 + 2.9 * len(groups))
+        figure, axes = plt.subplots(len(groups), 1, figsize=size, sharex=True, squeeze=False, layout="constrained")
+        for ax, group in zip(axes[:, 0], groups, strict=True):
             for s in group:
                 colour, dashes, _ = look[s.method.key]
                 label, wide = s.method.short_title, 1.2
@@ -177,9 +175,9 @@ def figure_sigma(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ..
                     shown = np.maximum(values[:SHOWN_VALUES] / values[0], LOWEST)
                     ax.plot(np.arange(1, len(shown) + 1), shown, color=colour, ls=dashes, lw=wide, label=label)
                     label, wide = "", 0.7  # of the further parts
-            ax.set(yscale="log", xlabel="number")
+            ax.set(yscale="log", ylabel="singular value over the first [1]")
             ax.legend(loc="upper right", handlelength=2.2, fontsize=6.5)
-        axes[0, 0].set_ylabel("singular value over the first")
+        axes[-1, 0].set_xlabel("number")
         return style.save(figure, out_png)
 
 

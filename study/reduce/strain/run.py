@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Any
 
 from softgrasp.fem.errors import SceneError
@@ -11,10 +11,9 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
 from softgrasp.study.reduce.result import reduce_result
 from softgrasp.study.reduce.strain.measure import measure_strain
-from softgrasp.study.reduce.strain.report import cell_table, error_table, sections, sentences, summary, time_table
-from softgrasp.study.reduce.strain.result import StrainFamily, StrainPoint, StrainStudy
+from softgrasp.study.reduce.strain.page import compose, sentences
+from softgrasp.study.reduce.strain.result import StrainFamily, StrainStudy
 from softgrasp.study.reduce.times import measured_run
-from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session
 
 
@@ -40,31 +39,21 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
         from softgrasp.study.reduce.strain.plots import draw  # brings Matplotlib
 
         picture = gather_picture(model)
-    lines = sentences(study)
     result = reduce_result(
         study.full,
         {
             "finite_strain": {f.key: _family(study, f) for f in study.families},
             "error_linear": study.linear,
             "reason_for_none": study.none,
-            "findings": lines,
+            "findings": sentences(study),
             "headline": study.turns,
         },
         study.times.to_json() | watch.seconds,
     )
 
     def page() -> Page:
-        files = draw(session.out, study, picture) if session.pictures else []
-        title = f"{scene.name}: reduced models at finite strain, {study.families[-1].points[0].engine} stepper"
-        names = (field.name for field in fields(StrainPoint))
-        rows = [(f.runs, *asdict(p).values()) for f in study.families for p in f.curves]
-        points = {"points.csv": Table(("runs", *names), rows)}
-        return Page(title, summary(study), sections(study, files), points, [*files, *models])
+        return compose(study, draw(session.out, study, picture) if session.pictures else [], [*models])
 
-    for table in (error_table(study), time_table(study), cell_table(study)):
-        session.console.print(table.terminal(wrap=(0,), width=session.console.width))
-    for sentence in (*lines, *summary(study)):
-        session.console.print(sentence, markup=False)
     session.write(scene, result, page)
     return result
 

@@ -86,7 +86,7 @@ def test_cells_of_a_box_are_those_of_its_mesh(comm: MPI.Intracomm, table: dict[s
 
 @pytest.mark.ranks
 def test_shares_of_the_nodes_add_up(comm: MPI.Intracomm) -> None:
-    found = need(make_scene(), 2, 10**6, comm, run=True)
+    found = need(make_scene(), 2, 10**6, comm.size, float("inf"), run=True)
     assert found.of(1.0, comm.size) == found.mesh + found.factor + comm.size * found.tables
     assert found.of(0.5, 1) * 2 == pytest.approx(found.of(1.0, 2), rel=1e-12)  # two nodes, one rank each
 
@@ -115,5 +115,5 @@ def test_finite_strain_counts_its_matrices(order: int) -> None:
     body.tangent(system.K_ee.createVecRight())
     matrices = (body.points.B, body.A, body.K, body.product)
     held = 12 * sum(A.getInfo()["nz_used"] for A in matrices if A is not None)  # a number and a column each
-    with_it, without = (need(s, 2, cells, MPI.COMM_SELF, True).mesh for s in (model.scene, make_scene(tissue=tissue)))
+    with_it, without = (need(s, 2, cells, 1, float("inf"), True).mesh for s in (model.scene, make_scene(tissue=tissue)))
     assert 0.2 < held / (with_it - without) < 1

@@ -275,9 +275,12 @@ def test_a_model_answers_inside_its_box_only() -> None:
         model.at(0.01, soft)
     with pytest.raises(ModelError, match="densities"):
         model.at(0.01, (replace(LAYERS[0], rho=2.0), LAYERS[1]))
-    assert model.at(0.01, soft, outside=True).run(hand_of(1.0)).energy_drift < 1e-8
+    outside = model.at(0.01, soft, outside=True).run(hand_of(1.0))
+    assert outside.energy_drift < 1e-8
+    assert outside.untrained == "mu = 39 Pa of layer 1 is outside the training range [40, 60] Pa"
     small = model.at(0.01, (replace(LAYERS[0], mu=41.0), LAYERS[1]))
     assert small.run(hand_of(1.0)).energy_drift < 1e-8
+    assert small.run(hand_of(1.0)).untrained == ""
     with pytest.raises(ModelError, match="acceleration in degree of freedom 1"):
         small.run(hand_of(3.0))
     for dt in (0.0, -0.01, np.nan):

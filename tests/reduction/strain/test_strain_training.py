@@ -166,6 +166,25 @@ def test_the_estimate_is_within_a_factor_of_three(scene: str, tmp_path: Path) ->
     assert count >= 14
 
 
+@pytest.mark.serial
+@pytest.mark.parametrize(("trained_with", "most"), [(0.0, 2e-3), (0.3, 1e-2)])
+def test_other_damping_than_that_of_the_training(trained_with: float, most: float) -> None:
+    """Against full runs: 1e-3 of a model that was trained undamped, 4e-3 of one whose training hardly swung."""
+
+    def damped(beta: float) -> FullRun:
+        model = built(*SMALL, *([f"effects.damping={{kind='kelvin-voigt', beta={beta}}}"] if beta else []))
+        return full_run(model, simulate(model))
+
+    own = damped(trained_with)
+    rom = train(own.model, [own], 24).reduce(24)
+    for beta in (0.0, 0.01, 0.3):
+        full = damped(beta)
+        run = replay_strain(rom, full, full.model, outside=True)
+        error = errors_strain(rom, run, full).z
+        assert error < most
+        assert 1 / 3 < run.error_estimate / error < 3  # measured 0.77 to 1.1
+
+
 EFFECTS = {
     "second order": ("tissue.order=2", "tissue.cells=[3, 6]"),
     "weight": ("effects.gravity={g=[0.0, -1.0]}", 'time.start="equilibrium"'),

@@ -17,8 +17,9 @@ from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.reduced import ReducedSystem
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.lqr.loop.margins import loop_margins
-from softgrasp.study.control.plots import figure_bode
+from softgrasp.study.control.plots import bode
 from softgrasp.study.control.run import run_control
+from softgrasp.study.pictures.style import save
 from softgrasp.study.reduce.run import run_reduce
 
 pytestmark = pytest.mark.serial
@@ -82,6 +83,6 @@ def test_controller_from_its_file(files: Path) -> None:
     assert told["distance"] == pytest.approx(margins.distance, rel=1e-12)
     assert [axis["phase"] for axis in told["axes"]] == pytest.approx([axis.phase for axis in margins.axes], rel=1e-12)
     assert 0.9 < margins.distance < 1.01  # the guarantee of LQR, which reduction and ticks of 1 ms hardly touch
-    (picture, *_) = figure_bode(margins, files / "bode.png")
+    (picture, *_) = save(bode(margins), files / "bode.png")
     assert picture.stat().st_size > 5000
     assert "Margins of the small controller" in (files / "control" / "report.html").read_text()

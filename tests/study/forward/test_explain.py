@@ -232,6 +232,7 @@ def test_digits_that_are_left() -> None:
     assert "about 5 digits, because nu = 0.5 - 2.0e-11" in inexact(5.7e-6, 1e-14, "cholesky", 0.5 - 2e-11)[0]
     assert "badly conditioned" in inexact(1e-12, 1e-7, "mumps", 0.3)[0]
     assert "time.rtol" in inexact(1e-12, 1e-2, "cg", 0.3)[0]
+    assert "about 2 digits, because time.rtol" in inexact(1e-12, 1e-5, "stars", 0.3, solves=2e-3)[0]
 
 
 @pytest.mark.serial

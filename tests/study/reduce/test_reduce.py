@@ -299,7 +299,7 @@ def test_command_writes_what_design_promises(mpi_tmp_path: Path, small: FullRun)
         assert (mpi_tmp_path / "compare.gif").stat().st_size > 5000
         if MPI.COMM_WORLD.size == 1 and find_chromium():
             assert look(mpi_tmp_path / "report.html", figures=8) == []
-        for words in ("PSD complex SVD, fixed solid modes", "Break-even mesh", "N counts all columns of V", "x new"):
+        for words in ("PSD complex SVD, fixed", "Break-even mesh", "N counts all columns of V", "x new"):
             assert words in text
         for sentence in saved["findings"]:
             assert " ".join(sentence.split()) in " ".join(text.split())
@@ -398,15 +398,14 @@ def test_terminal_says_what_is_refused(mpi_tmp_path: Path) -> None:
         "pod_fixed": [2000], "psd_fixed": [13, 2000], "craig_bampton": [13, 2000],
     }  # fmt: skip
     if MPI.COMM_WORLD.rank == 0:
-        words = " ".join(text.split())
-        assert "N = 13 refused for PSD complex SVD, fixed; Craig-Bampton: only even N exist for this basis." in words
-        for title in ("POD, fixed", "PSD complex SVD, fixed", "Craig-Bampton"):
-            assert f"N = 2000 refused for {title}: more than " in words
-        (row,) = (line for line in text.splitlines() if line.startswith("Craig-Bampton"))
-        assert row.split() == ["Craig-Bampton", "-", "refused"]
+        refused = " ".join(text[text.index("Refused") :].split())
+        for words in ("13 PSD complex", "2000 POD, fixed", "only even N exist for this basis", "more than"):
+            assert words in refused, words
+        (row,) = (line for line in text.splitlines() if line.startswith("Craig-Bampton") and "refused" in line)
+        assert set(row.split()) == {"Craig-Bampton", "-", "refused"}
         assert "stable N" in text  # the last column is whole
         page = (mpi_tmp_path / "report.html").read_text()
-        assert "PSD complex SVD, fixed solid modes; Craig-Bampton" in page
+        assert "PSD complex SVD, fixed; Craig-Bampton" in page
         assert "only even N exist for this basis" in page
 
 
@@ -449,7 +448,7 @@ def test_a_headline_needs_quartiles_that_agree_and_names_the_error_at_new_materi
     close, apart = Spread(24.0, 25.0, 26.0), Spread(20.0, 40.0, 60.0)
     said = Turns(close, close, 9).sentence(7e-3, "33.00% in the median and 84.00% at most at new materials")
     assert said.startswith("It runs 25 (24 to 26) times as fast")
-    assert "error 0.70% at the scene's parameter" in said
+    assert "error 0.7 % at the scene's parameter" in said
     assert "84.00% at most at new materials" in said
     for turns in (Turns(apart, close, 9), Turns(close, apart, 9)):
         assert "too much to name a speed-up" in turns.sentence(7e-3, "")

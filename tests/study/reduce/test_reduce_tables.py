@@ -8,7 +8,7 @@ from pathlib import Path
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS
 from softgrasp.study.reduce.linear.findings import findings
 from softgrasp.study.reduce.linear.measure import FURTHER, chosen_methods
-from softgrasp.study.reduce.linear.report import error_table, least_size, stability
+from softgrasp.study.reduce.linear.page import error_table, least_size, stability
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, best, kept_points, nearest
 from tests.helpers.models import make_scene
 
@@ -16,8 +16,8 @@ PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"
 
 
 def test_scene_chooses_methods() -> None:
-    assert chosen_methods(make_scene().reduction) == (*PAPER_METHODS, *FURTHER)
-    assert chosen_methods(make_scene(reduction={"methods": ["psd_qv"]}).reduction) == ("psd_qv",)
+    assert chosen_methods(make_scene()) == (*PAPER_METHODS, *FURTHER)
+    assert chosen_methods(make_scene(reduction={"methods": ["psd_qv"]})) == ("psd_qv",)
 
 
 def point(N: int, error: float, stable: bool = True, online: float = 1e-3) -> Point:
@@ -32,7 +32,7 @@ def test_choice_of_points() -> None:
     assert kept_points(points) == {12, 14, 30, 40}  # nearest to 14, all and stable, nearest to 30, best
     assert least_size(points, 1e-2) == 12
     assert least_size(points, 1e-6) is None  # an unstable model does not count
-    assert stability(points) == "not 14"
+    assert stability(swept_of("psd", *points)) == "not 14"
     assert nearest([]) is None
 
 
@@ -61,6 +61,6 @@ def test_table_shows_the_deformation_first_and_the_split() -> None:
     sweep = swept_of("componentwise_pod_fixed", point(6, 0.2), split, point(30, 1e-3, stable=False))
     table = error_table([sweep], 0.999)
     assert dict(zip(table.header, *table.rows, strict=True)) == {
-        "method": "componentwise POD, fixed solid modes", "99.9 %": "-", "N": "14", "V_e": "5+5", "deform.": "1.0e-02",
-        "state": "2.0e-02", "energy": "2.0e-02", "1e-1": "14", "1e-2": "14", "1e-3": "-", "stable N": "not 30",
+        "method": "componentwise POD, fixed", "99.9 %": "-", "N": "14", "V_e": "5+5", "deform.": "1 %",
+        "state": "2 %", "energy": "2 %", "to 10 %": 14, "to 1 %": 14, "to 0.1 %": "-", "stable N": "not 30",
     }  # fmt: skip

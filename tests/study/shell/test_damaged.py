@@ -28,9 +28,11 @@ from softgrasp.fem.mesh.file import load_arrays
 from softgrasp.fem.owned import LIST, LOCK, hold, own_files, release
 from softgrasp.fem.run.simulate import RunOptions
 from softgrasp.fem.scene.table import read_csv
+from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.reduction.archive import save
 from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.study.precision.cache import Cache
+from softgrasp.study.query.request import read_batch
 from softgrasp.study.runs.listing import compare, runs_below
 from softgrasp.study.runs.run import run_sweep
 from softgrasp.study.runs.sweep import Sweep, parse_axes, read_points
@@ -155,8 +157,17 @@ def kinds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Kind]:
         made[f"mesh .{suffix}"] = Kind(
             body, lambda at, name=body.name: load_arrays(at / name, 1.0, repair=False, limit=2.0), body.parent, False
         )
+    body = folder("mesh-ansys") / "body.msh"
+    strip.write(body, "ansys", binary=False)
+    made["mesh .msh of Ansys"] = Kind(
+        body, lambda at: load_arrays(at / "body.msh", 1.0, repair=False, limit=2.0), body.parent, False
+    )
+    batch = folder("batch") / "batch.csv"
+    batch.write_text("lambda [Pa],mu\n" + "".join(f"{50 + i},{40.5 + i}\n" for i in range(12)))
+    made["batch table"] = Kind(batch, lambda at: read_batch(at / "batch.csv"), batch.parent, False)
     add_runs(made, folder)
     add_models(made, folder)
+    add_gains(made, folder)
     return made
 
 
@@ -252,11 +263,32 @@ def add_models(made: dict[str, Kind], folder: Callable[[str], Path]) -> None:
     made["cache of a study"] = Kind(next(cache.glob("*.json")), measured, cache)
 
 
+def add_gains(made: dict[str, Kind], folder: Callable[[str], Path]) -> None:
+    """Restart files of Newton's method with ADI."""
+    damped = "effects.damping={kind='kelvin-voigt', beta=0.01}"
+    problem, stopped = sg.problem(sg.build("paper_lqr", ["tissue.cells=[4,8]", damped])), folder("newton")
+
+    def stop(entry: dict[str, float]) -> None:
+        if entry["solve"] == 8:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        NewtonADI(checkpoint=stopped, checkpoint_every=4, progress=stop).solve(problem)
+
+    def resumed(at: Path) -> Any:
+        found = NewtonADI(checkpoint=at).solve(problem)
+        return found.gain.K_s, found.residual, found.counts
+
+    made["restart arrays of a gain"] = Kind(next(stopped.glob("*.npz")), resumed, stopped)
+    made["restart manifest of a gain"] = Kind(stopped / "newton.json", resumed, stopped)
+
+
 NAMES = (
     "scene", "motion", "mesh .msh", "mesh .vtu", "mesh .inp", "mesh .mesh", "mesh .vtk", "mesh .xdmf",
     "restart arrays", "restart manifest", "snapshots", "fields .vtu", "fields .pvd", "result.json", "trajectory.csv",
     "scene.toml of a run", "list of files", "lock", "points of a sweep", "linear model", "strain model",
-    "certified model", "controller", "cache of a study",
+    "certified model", "controller", "cache of a study", "mesh .msh of Ansys", "batch table",
+    "restart arrays of a gain", "restart manifest of a gain",
 )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from softgrasp.fem.owned import LIST, LOCK, Process, hold, locked, note, read_li
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.runs.listing import run_compare
-from softgrasp.study.shell.folder import claim, default_folder
+from softgrasp.study.shell.folder import claim, default_folder, folder_lock
 
 SMALL = ["tissue.cells=[3,6]", "time.steps=20", "output.frames=2"]
 QUIET = Console(quiet=True)
@@ -190,3 +190,30 @@ def test_a_library_run_that_streams_holds_its_folder(comm: MPI.Intracomm, mpi_tm
     with pytest.raises(SceneError, match="process 12 on node7"), locked(comm, mpi_tmp_path):
         pytest.fail("entered")  # on any rank
     assert owned._held is None
+
+
+def test_a_command_inside_another_leaves_the_outer_one_its_folder(tmp_path: Path) -> None:
+    """Elsewhere and in the same folder, also where the inner one fails."""
+    outer, inner = tmp_path / "outer", tmp_path / "inner"
+
+    @folder_lock()
+    def run(out: Path, *others: Path) -> None:
+        claim(out, "simulate", "block")
+        for other in others:
+            run(other)
+            assert (out / LOCK).is_file()
+            assert (other / LOCK).is_file() == (other == out)
+        note(out / "result.json")
+        if others:
+            (out / "result.json").write_text("{}")
+
+    run(outer, inner, outer)
+    assert not (outer / LOCK).exists()
+    assert read_list(outer) == (("simulate", "block"), {"result.json"})
+    assert not inner.exists()
+    with folder_lock():
+        claim(outer, "simulate", "block")
+        with pytest.raises(SceneError, match="holds the results of simulate on block"), folder_lock():
+            claim(outer, "reduce", "strip")
+        assert (outer / LOCK).is_file()
+    assert not (outer / LOCK).exists()

@@ -1,17 +1,26 @@
-"""Tables, sentences and page of ``softgrasp reduce`` at finite strain."""
+"""The page of ``softgrasp reduce`` at finite strain, parts of which a terminal shows too, and its tables."""
 
 from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
 
-from softgrasp.study.reduce.strain.result import CELLS_AT, StrainFamily, StrainStudy, most_accurate
-from softgrasp.study.reduce.tables import TIMES, time_cells
+from softgrasp.study.reduce.strain.result import (
+    CELLS_AT,
+    HeldOutTest,
+    StrainFamily,
+    StrainPoint,
+    StrainStudy,
+    most_accurate,
+)
+from softgrasp.study.reduce.tables import TIMES, timed
 from softgrasp.study.report.page import Section, captioned
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report.tables import Columns, Table, percent, table_of
+from softgrasp.study.shell.session import Page
 
 CAPTIONS = {
     "strain_errors.png": "Error of the deformation z against N, and against the number of sampled cells at some N. "
@@ -27,76 +36,65 @@ NOTE = (
     "sampling. new material, new motion: largest error of z on full runs inside the box that trained no model; "
     "-: there are none, or the model refuses them. drift: of the model's own energy."
 )
+ERRORS: Columns = {
+    "runs": "f.runs", "N": "p.N", "cells": "p.cells", "own": "p.error_own %", "estimate": "p.estimate_own %",
+    "energy": "p.error_own_energy_norm %", "all cells": "p.error_galerkin %", "new material": "p.error_materials %",
+    "new motion": "p.error_motions %", "drift": "p.drift .0e",
+}  # fmt: skip
+CELLS: Columns = {
+    "runs": "f.runs", "N": "p.N", "tau": "p.tau .1e", "cells": "p.cells", "own": "p.error_own %",
+    "new material": "p.error_materials %", "new motion": "p.error_motions %",
+    "run [ms]": lambda r: f"{1e3 * r['p'].time_online:.2f}",
+}  # fmt: skip
 
 
-def sections(study: StrainStudy, files: Sequence[Path]) -> list[Section]:
-    """Parts of the page."""
-    held = [test_table(f).section(title=f"Held-out runs, models {f.title}") for f in study.families if f.tests]
-    return [
-        error_table(study).section(NOTE),
-        Section("What holds", text="\n\n".join(sentences(study))),
-        Section("", figures=captioned(files, CAPTIONS)),
-        time_table(study).section(),
-        cell_table(study).section(),
-        *held,
-    ]
-
-
-def error_table(study: StrainStudy) -> Table:
-    """One line for each family and N."""
-    header = ("runs", "N", "cells", "own", "estimate", "energy", "all cells", "new material", "new motion", "drift")
-    rows = [
-        (f.runs, p.N, p.cells, *map(_short, (p.error_own, p.estimate_own, p.error_own_energy_norm)),
-         _short(p.error_galerkin), *map(_short, (p.error_materials, p.error_motions)), f"{p.drift:.0e}")
-        for f in study.families for p in f.points
-    ]  # fmt: skip
-    return Table(header, rows, "Errors")
-
-
-def cell_table(study: StrainStudy) -> Table:
-    """Error against the number of cells where tau was varied."""
-    header = ("runs", "N", "tau", "cells", "own", "new material", "new motion", "run [ms]")
-    rows = [
-        (f.runs, p.N, _short(p.tau), p.cells, *map(_short, (p.error_own, p.error_materials, p.error_motions)),
-         f"{1e3 * p.time_online:.2f}")
+def compose(study: StrainStudy, drawn: Sequence[Path], models: Sequence[Path]) -> Page:
+    """The page; ``drawn``: pictures, ``models``: files of the reduced models."""
+    pairs = [{"f": f, "p": p} for f in study.families for p in f.points]
+    curves = [
+        {"f": f, "p": p}
         for f in study.families
         for p in sorted((p for p in f.curves if p.N in CELLS_AT), key=lambda p: (p.N, -p.tau))
-    ]  # fmt: skip
-    return Table(header, rows, "Cells")
-
-
-def time_table(study: StrainStudy) -> Table:
-    """Seconds and speed-ups, costs counted whole."""
-    rows = [(f.runs, p.N, p.cells, *time_cells(p, study.times)) for f in study.families for p in f.points]
-    return Table(("runs", "N", "cells", *TIMES), rows, "Times")
+    ]
+    times = [timed(p, study.times, f=f) for f in study.families for p in f.points]
+    held = [test_table(f).section(title=f"Held-out runs, models {f.title}") for f in study.families if f.tests]
+    parts = [
+        Section("", figures=captioned(drawn, CAPTIONS)),
+        table_of(pairs, ERRORS, "Errors").section(details=NOTE, terminal=True),
+        table_of(times, {"runs": "f.runs", "N": "p.N", "cells": "p.cells", **TIMES}, "Times").section(terminal=True),
+        Section("Findings", "\n\n".join(sentences(study)), terminal=True),
+        table_of(curves, CELLS, "Cells").section(),
+        *held,
+    ]
+    names = (field.name for field in fields(StrainPoint))
+    points = Table(("runs", *names), [(f.runs, *asdict(p).values()) for f in study.families for p in f.curves])
+    model = study.full.model
+    title = f"{model.scene.name}: reduced models at finite strain, {study.families[-1].points[0].engine} stepper"
+    law = "" if model.system.points is None else f" (law: {model.system.points.law})"
+    linear = f"Linear elasticity has an error of {percent(study.linear)} of the deformation of this scene{law}."
+    files = [*drawn, *models]
+    return Page(title, [linear], parts, {"points.csv": points}, files, errors=headline(study))
 
 
 def test_table(family: StrainFamily) -> Table:
     """Every held-out run with a column for each N: the error, and its estimate in brackets."""
+
+    def missed(t: HeldOutTest, N: int) -> str:
+        error, estimate = ("-" if x is None else percent(x) for x in (t.errors[N], t.estimates[N]))
+        return f"{error} ({estimate})"
+
     sizes = [p.N for p in family.points]
     rows = [
-        (
-            t.kind,
-            f"{t.lam:.4g}",
-            f"{t.mu:.4g}",
-            ", ".join(f"{x:.3g}" for x in t.target),
-            *(f"{_short(t.errors[N])} ({_short(t.estimates[N])})" for N in sizes),
-        )
+        (t.kind, f"{t.lam:.4g}", f"{t.mu:.4g}", ", ".join(f"{x:.3g}" for x in t.target), *(missed(t, N) for N in sizes))
         for t in family.tests
     ]
     return Table(("new", "lambda [Pa]", "mu [Pa]", "target [m]", *(f"N = {N}" for N in sizes)), rows)
 
 
-def _short(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1e}"
-
-
 def sentences(study: StrainStudy) -> list[str]:
-    """What the numbers say."""
-    full, points = study.full, study.full.model.system.points
-    law = "" if points is None else points.law
+    """What the models answer for, and how good their estimates are."""
+    full = study.full
     lines = [
-        f"Law: {law}. Linear elasticity misses the deformation of this scene by {100 * study.linear:.3g} %.",
         f"Full model: {len(full.trajectory.times) - 1} steps in {study.times.steps:.3g} s, factorisation "
         f"{1e3 * study.times.factor:.3g} ms. x again: its steps over a run of the same reduced model again. x new: "
         "factorisation and steps over a new parameter with its run. offline: basis, model on all cells, forces and "
@@ -115,7 +113,7 @@ def sentences(study: StrainStudy) -> list[str]:
         errors = {N: [e for t in f.tests if (e := t.errors.get(N)) is not None] for N in f.models}
         best = min(((statistics.median(e), N) for N, e in errors.items() if e), default=None)
         if best is not None:
-            lines.append(f"Median error over {len(f.tests)} held-out runs: least at N = {best[1]}, {best[0]:.1e}.")
+            lines.append(f"Median error over {len(f.tests)} held-out runs: least at N = {best[1]}, {percent(best[0])}.")
         pairs = [(t.estimates[N], error) for t in f.tests for N, error in t.errors.items()]
         ratios = [estimate / error for estimate, error in pairs if estimate is not None and error]
         if ratios:
@@ -133,17 +131,17 @@ def sentences(study: StrainStudy) -> list[str]:
     return lines
 
 
-def summary(study: StrainStudy) -> list[str]:
-    """What came out, in three sentences."""
+def headline(study: StrainStudy) -> list[str]:
+    """Error and speed of the most accurate model."""
     p, f = most_accurate(study.families)
     held = [e for t in f.tests if (e := t.errors.get(p.N)) is not None]
     others = "not tested on other runs"
     if held:
-        others = f"{statistics.median(held):.2%} in the median and {max(held):.2%} at most on {len(held)} held-out runs"
+        median, largest = percent(statistics.median(held)), percent(max(held))
+        others = f"{median} in the median and {largest} at most on {len(held)} held-out runs"
     if f.key == "own":
         others += "; it refuses other materials"
     return [
-        f"Linear elasticity misses the deformation of this scene by {study.linear:.2%}.",
         f"The most accurate reduced model, {f.title}, has N = {p.N} columns and {p.cells} sampled cells.",
         study.turns.sentence(p.error_own, others),
     ]

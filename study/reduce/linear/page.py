@@ -1,12 +1,12 @@
-"""Tables, sentences and page of ``softgrasp reduce``."""
+"""What ``softgrasp reduce`` shows: one page, parts of which a terminal shows too, and its tables."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import astuple, fields
 from pathlib import Path
+from typing import Any
 
-from softgrasp.reduction.bases.registry import Method
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
     N_NOTE,
@@ -18,12 +18,13 @@ from softgrasp.study.reduce.linear.result import (
     nearest,
     timed_points,
 )
-from softgrasp.study.reduce.tables import TIMES, short, time_cells
+from softgrasp.study.reduce.tables import TIMES, timed
 from softgrasp.study.report.page import Section, captioned
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report.tables import Columns, Table, percent, table_of
+from softgrasp.study.shell.session import Page
 
 LEVELS = (1e-1, 1e-2, 1e-3)  # of the error of the deformation, for which the least N is named
-LEVEL_NAMES = tuple(f"{level:.0e}".replace("e-0", "e-") for level in LEVELS)
+FIRST = ("errors.png", "errors_beyond.png")  # pictures below the summary
 CAPTIONS = {
     "errors.png": "Error of the deformation of the paper's six methods against N, all columns of V counted. A curve "
     "is dotted where its model is unstable (crosses). Errors above 1 are drawn at 1.",
@@ -42,6 +43,42 @@ CAPTIONS = {
     "compare.png": "Reduced bodies under the outline of the full one, at instants of large deformation or error.",
     "compare.gif": "The same in motion.",
 }
+HOW = "Each method is built from the snapshots of one run and repeats it, driven by the same hand."
+
+
+def compose(study: ReductionStudy, drawn: Sequence[Path], models: Sequence[Path]) -> Page:
+    """The page; ``drawn``: pictures, ``models``: files of the reduced models."""
+    scene, sweeps, figures = study.full.model.scene, study.sweeps, captioned(drawn, CAPTIONS)
+    energy, refused = scene.reduction.energy, refused_table(sweeps)
+    notes = (N_NOTE, error_note(energy), inner_note(sweeps))
+    parts = [
+        Section("", figures=[(file, text) for file, text in figures if file.name in FIRST]),
+        error_table(sweeps, energy).section(HOW, details="\n\n".join(notes), terminal=True),
+        Section("Findings", text="\n\n".join(study.findings), terminal=True),
+        time_table(study).section(details="\n\n".join(study.speed_notes), terminal=True),
+        *([refused.section(terminal=True)] if refused.rows else []),
+        *box_sections(study.box),
+        Section("Pictures", figures=[(file, text) for file, text in figures if file.name not in FIRST]),
+    ]
+    tables, files = {"points.csv": point_table(study)}, [*drawn, *models]
+    return Page(f"{scene.name}: reduced models", summary(study), parts, tables, files, errors=headline(study))
+
+
+def error_table(sweeps: Sequence[MethodSweep], energy: float) -> Table:
+    """N by energy, errors at the N nearest to the one compared, least N for some errors, stability."""
+    columns: Columns = {
+        "method": "s.method.short_title", f"{100 * energy:g} %": "s.N_energy 3", "N": _size,
+        "V_e": lambda r: r["p"] and "+".join(map(str, r["p"].split)), "deform.": "p.error_deformation %",
+        "state": "p.error %", "energy": "p.error_energy %",
+        **{f"to {percent(x)}": lambda r, x=x: least_size(r["s"].points, x) or "-" for x in LEVELS},  # type: ignore[misc]
+        "stable N": lambda r: stability(r["s"]),
+    }  # fmt: skip
+    return table_of([{"s": s, "p": nearest(s.points, stable=False)} for s in sweeps], columns, "Errors")
+
+
+def _size(row: dict[str, Any]) -> str:
+    p = row["p"]
+    return "-" if p is None else str(p.N) if p.stable else f"{p.N} !"
 
 
 def least_size(points: Sequence[Point], level: float) -> int | None:
@@ -49,94 +86,75 @@ def least_size(points: Sequence[Point], level: float) -> int | None:
     return min((p.N for p in points if p.stable and p.error_deformation <= level), default=None)
 
 
-def title_of(method: Method, narrow: bool) -> str:
-    """The name of a method in a table, short in a narrow one."""
-    return method.short_title if narrow else method.title
-
-
-def stability(points: Sequence[Point]) -> str:
+def stability(sweep: MethodSweep) -> str:
     """At which N a method is stable, in few words."""
-    bad = [p.N for p in points if not p.stable]
+    points = sweep.points
     if not points:
-        return "no model"
+        return "refused" if sweep.refused else "no model"
+    bad = [p.N for p in points if not p.stable]
     if not bad:
         return f"all, {points[0].N} to {points[-1].N}"
-    if len(bad) == len(points):
-        return "none"
-    return "not " + ", ".join(map(str, bad))
-
-
-def _size(p: Point) -> str:
-    return str(p.N) if p.stable else f"{p.N} !"
-
-
-def error_table(sweeps: Sequence[MethodSweep], energy: float, narrow: bool = False) -> Table:
-    """N by energy, errors at the N nearest to the one compared, least N for some errors, stability."""
-    header = ("method", f"{100 * energy:g} %", "N", "V_e", "deform.", "state", "energy", *LEVEL_NAMES, "stable N")
-    rows = []
-    for s in sweeps:
-        p, cells = nearest(s.points, stable=False), ["" for _ in header[2:-1]]
-        if p is not None:
-            errors = (f"{value:.1e}" for value in (p.error_deformation, p.error, p.error_energy))
-            least = ("-" if (n := least_size(s.points, level)) is None else str(n) for level in LEVELS)
-            cells = [_size(p), "+".join(map(str, p.split)), *errors, *least]
-        stable = stability(s.points) if s.points else "refused" if s.refused else "no model"
-        rows.append((title_of(s.method, narrow), "-" if s.N_energy is None else str(s.N_energy), *cells, stable))
-    return Table(header, rows, "Errors")
+    return "none" if len(bad) == len(points) else "not " + ", ".join(map(str, bad))
 
 
 def error_note(energy: float) -> str:
     """What the columns of the first table hold; ``energy``: share of the scene."""
     return (
-        f"{100 * energy:g} %: N that keeps this share of the energy of the snapshots. Then, at the N nearest to "
-        f"{COMPARED}, the relative errors of the deformation, of the state [q_s, v_s, q_e, v_e] (the paper's error) "
+        f"Energy of {100 * energy:g} %: N that keeps this share of the energy of the snapshots. Then, at the N nearest "
+        f"to {COMPARED}, the relative errors of the deformation, of the state [q_s, v_s, q_e, v_e] (the paper's error) "
         "and of the energy, the same for every method; the least N of a stable model with an error of the deformation "
-        f"up to {', '.join(LEVEL_NAMES)}; !: unstable."
+        f"up to {', '.join(map(percent, LEVELS))}; !: unstable. fixed: with fixed solid modes."
     )
 
 
-def refused_table(sweeps: Sequence[MethodSweep], narrow: bool = False) -> Table:
+def refused_table(sweeps: Sequence[MethodSweep]) -> Table:
     """N that were refused, the methods, and the one reason: methods and N that share it stand together."""
     groups: dict[tuple[str, str], list[str]] = {}
     for s in sweeps:
         for reason in dict.fromkeys(s.refused.values()):
             sizes = ", ".join(str(N) for N, why in s.refused.items() if why == reason)
-            groups.setdefault((sizes, reason), []).append(title_of(s.method, narrow))
+            groups.setdefault((sizes, reason), []).append(s.method.short_title)
     rows = [(sizes, "; ".join(titles), reason) for (sizes, reason), titles in groups.items()]
     return Table(("N", "method", "reason"), rows, "Refused")
 
 
-def summary(study: ReductionStudy) -> list[str]:
-    """What came out, in three sentences."""
+def headline(study: ReductionStudy) -> list[str]:
+    """Error and speed of the most accurate stable model at the N compared."""
     if not (chosen := by_error(study.sweeps)):
-        return ["No method has a stable model."]
+        return []
     s, point = chosen[0]
-    held = [s for s in study.sweeps if s.points and all(p.stable for p in s.points)]
     tested = [e for e in study.box.summary if (e.method, e.N) == (s.method.key, point.N) and e.runs <= 1]
     others = f"not tested at new materials ({study.box.none})"
     if tested:
-        others = f"{tested[0].median:.2%} in the median and {tested[0].largest:.2%} at most at new materials"
+        others = f"{percent(tested[0].median)} in the median and {percent(tested[0].largest)} at most at new materials"
     return [
         f"At N = {point.N} the most accurate stable model is {s.method.title}.",
         *([] if study.turns is None else [study.turns.sentence(point.error_deformation, others)]),
-        f"{len(held)} of {len(study.sweeps)} methods are stable at every N that was tried.",
     ]
 
 
-def time_table(study: ReductionStudy, narrow: bool = False) -> Table:
+def summary(study: ReductionStudy) -> list[str]:
+    """How many methods are stable."""
+    held = [s for s in study.sweeps if s.points and all(p.stable for p in s.points)]
+    if not by_error(study.sweeps):
+        return ["No method has a stable model."]
+    return [f"{len(held)} of {len(study.sweeps)} methods are stable at every N that was tried."]
+
+
+def time_table(study: ReductionStudy) -> Table:
     """Seconds and speed-ups."""
-    chosen = timed_points(study.sweeps)
-    rows = [(title_of(method, narrow), _size(p), *time_cells(p, study.times)) for method, p in chosen]
-    return Table(("method", "N", *TIMES), rows, "Times")
+    rows = [timed(p, study.times, method=method.short_title) for method, p in timed_points(study.sweeps)]
+    return table_of(rows, {"method": "method", "N": _size, **TIMES}, "Times")
 
 
-def box_table(box: DomainTests, narrow: bool = False) -> Table:
+def box_table(box: DomainTests) -> Table:
     """Errors at other parameters, trained by one run or by several."""
-    titles = {m.method.key: title_of(m.method, narrow) for m in box.models}
-    rows = [
-        (titles[e.method], str(e.N), str(e.runs or "-"), *map(short, (e.own, e.median, e.largest))) for e in box.summary
-    ]
-    return Table(("method", "N", "runs", "own", "median", "largest"), rows, "Other parameters")
+    titles = {m.method.key: m.method.short_title for m in box.models}
+    columns: Columns = {
+        "method": lambda e: titles[e.method], "N": "N", "runs": lambda e: e.runs or "-", "own": "own %",
+        "median": "median %", "largest": "largest %",
+    }  # fmt: skip
+    return table_of(box.summary, columns, "Other parameters")
 
 
 def box_note(box: DomainTests) -> str:
@@ -174,37 +192,19 @@ def point_table(study: ReductionStudy) -> Table:
     return Table(("method", *names), [(s.method.key, *astuple(p)) for s in study.sweeps for p in s.points])
 
 
-def sections(study: ReductionStudy, files: Sequence[Path]) -> list[Section]:
-    """Parts of the page. Rank 0 only."""
-    energy = study.full.model.scene.reduction.energy
-    text = (
-        f"{N_NOTE}\n\n{error_note(energy)} Each method is built from the snapshots of one run and "
-        f"repeats it, driven by the same hand. {inner_note(study.sweeps)}"
-    )
-    parts = [
-        error_table(study.sweeps, energy).section(text),
-        Section("What holds", text="\n\n".join(study.findings)),
-        Section("", figures=captioned(files, CAPTIONS)),
-        time_table(study).section("\n\n".join(study.speed_notes)),
-    ]
-    refused = refused_table(study.sweeps)
-    parts += [refused.section()] if refused.rows else []
-    return [*parts, *box_sections(study.box)]
-
-
 def box_sections(box: DomainTests) -> list[Section]:
     """Errors at other parameters: a summary, and one table for each N with a column for each basis."""
     if box.none:
-        return [Section("Other parameters", f"No tests at other parameters: {box.none}.")]
-    text = " Undamped vibrations of slightly wrong frequency drift out of phase, so errors grow with the run."
-    parts = [box_table(box).section(box_note(box) + text)]
+        return [Section("Other parameters", f"No tests at other parameters: {box.none}.", terminal=True)]
+    text = "Undamped vibrations of slightly wrong frequency drift out of phase, so errors grow with the run."
+    parts = [box_table(box).section(box_note(box), details=text, terminal=True)]
     for N in sorted({m.model.N for m in box.models}):
         shown = [(i, m) for i, m in enumerate(box.models) if m.model.N == N]
-        names = (m.method.title + (", several runs" if m.several else "") for _, m in shown)
+        names = (m.method.short_title + (", several runs" if m.several else "") for _, m in shown)
         rows = [
-            (f"{p.lam:.4g}", f"{p.mu:.4g}", "trained" if p.trained else "test", *(p.errors[i] for i, _ in shown))
+            (f"{p.lam:.4g}", f"{p.mu:.4g}", "trained" if p.trained else "test",
+             *(percent(p.errors[i]) for i, _ in shown))
             for p in box.points
-        ]
-        table = Table(("lambda [Pa]", "mu [Pa]", "", *names), rows)
-        parts.append(table.section(f"All parameters, N = {N}."))
+        ]  # fmt: skip
+        parts.append(Table(("lambda [Pa]", "mu [Pa]", "", *names), rows).section(f"All parameters, N = {N}."))
     return parts

@@ -1,0 +1,106 @@
+"""What the run of a scene would cost on other ranks, by the model of :mod:`softgrasp.fem.solve.costs`.
+
+Seconds of cores like the one where its constants were measured; pictures and the estimate of the mesh come on top.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import psutil
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.memory import free_bytes, need, size_text, steps_of
+from softgrasp.fem.run.simulate import frame_count
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.costs import BUILD, ENTRIES, ITERATIVE, SolverName, seams
+
+TYPICAL, WORST = 1.3, 2.6  # factors of `python -m benchmarks scale`, the geometric mean and the largest, of whole runs
+START = 3.0  # time of every command: imports, page and pictures of a small run [s]
+LIBRARIES = 160.0 * 2**20  # memory of the libraries on each rank [byte]
+PRODUCTS = 2  # products of a step beside its solve, those of its vectors included [1]
+# Time of a frame of the field files, by dimension and order [s a cell].
+FRAME = {(2, 1): 3.5e-7, (2, 2): 6e-7, (2, 3): 1.1e-6, (3, 1): 3.5e-7, (3, 2): 8e-7, (3, 3): 3e-6}
+RELIABLE = f"wrong by a factor of {TYPICAL:g}, at most {WORST:g}, on the machine where it was measured (1 and 2 ranks)"
+RANKS = (1, 2, 16, 128)  # numbers of ranks that are told
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Modelled cost of a run."""
+
+    ranks: int  # number of ranks [1]
+    solver: SolverName  # solver of the steps
+    build: float  # time of mesh and assembly [s]
+    setup: float  # time of the set-up of the solver [s]
+    equilibrium: float  # time of the equilibrium at the start [s]; 0 without one
+    steps: float  # time of all steps [s]
+    fields: float  # time of the field files [s]
+    frames: int  # number of their instants [1]
+    memory: float  # memory over all ranks [byte]
+
+    @property
+    def seconds(self) -> float:
+        """Time in all, the start of the command included [s]."""
+        return START + self.build + self.setup + self.equilibrium + self.steps + self.fields
+
+
+def forecast(scene: Scene, n: int, d: int, cells: int, ranks: int, free: float = np.inf) -> Forecast:
+    """The cost of a linear run on so many ranks.
+
+    Args:
+        n: unknowns of the tissue.
+        d: dimension.
+        cells: triangles or tetrahedra.
+        free: memory that the solver may take over all ranks [byte].
+    """
+    kind, work, share = (d, scene.tissue.order), steps_of(scene, n, d, ranks), seams(n, d, ranks)
+    name, requested = work.solver(scene.time.solver, free), scene.time.solver
+    static, first = replace(work, solves=1, few=True), scene.time.start == "equilibrium" and scene.effects.gravity
+    frames = frame_count(scene, n) + 1 if scene.output.fields != "none" else 0
+    memory = need(scene, d, cells, ranks, free, run=True).of(1.0, ranks) + ranks * LIBRARIES
+    if name in ITERATIVE:
+        memory += work.memory(name)
+    if first:  # both are there at once
+        memory += static.memory(static.solver(requested))
+    return Forecast(
+        ranks=ranks,
+        solver=name,
+        build=BUILD[kind] * cells * share,
+        setup=work.setup(name),
+        equilibrium=static.seconds(static.solver(requested)) if first else 0.0,
+        steps=work.solves * (work.solve(name) + PRODUCTS * work.product(ENTRIES[kind])),
+        frames=frames,
+        fields=frames * FRAME[kind] * cells * share,
+        memory=memory,
+    )
+
+
+def forecasts(model: Model) -> tuple[Forecast, ...]:
+    """The cost of a model's run on its own number of ranks and on :data:`RANKS`; none at finite strain. Collective.
+
+    Ranks beyond the cores of this node are on further nodes like it.
+    """
+    scene, layout, mesh = model.scene, model.system.layout, model.space.mesh
+    if model.system.points is not None:
+        return ()
+    comm, cores = layout.comm, psutil.cpu_count(logical=False) or 1
+    free = comm.allreduce(free_bytes(scene), MPI.MIN)
+    cells = int(mesh.mesh.topology.index_map(mesh.dimension).size_global)
+    counts = sorted({*RANKS, comm.size})
+    return tuple(
+        forecast(scene, layout.n_e, layout.dimension, cells, ranks, free * -(-ranks // cores)) for ranks in counts
+    )
+
+
+def told(results: Sequence[Forecast]) -> str:
+    """Time and memory by the number of ranks in one sentence; empty without any."""
+    if not results:
+        return ""
+    first, *others = [f"{f.seconds:.2g} s and {size_text(f.memory)}" for f in results]
+    ranks = [f"{f.ranks}" for f in results]
+    rest = ", ".join(f"{text} on {count}" for text, count in zip(others, ranks[1:], strict=True))
+    return f"cost model: about {first} on {ranks[0]} rank, {rest}; {RELIABLE}"

@@ -1,0 +1,300 @@
+"""Plans past obstacles: a sequence of problems of least distance, each with one half-plane per interval and obstacle.
+
+The half-planes of one plan separate body and obstacle, so that it is feasible for the half-planes drawn from it: costs
+fall from round to round and every round is safe. Both sides of an obstacle on the way are tried.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softgrasp.fem.obstacles.shapes import HalfSpace, Shape
+from softgrasp.fem.petsc import Array
+from softgrasp.lqr.constrained.horizon import HeldPlant, Horizon
+from softgrasp.lqr.constrained.least_distance import InfeasibleError, nearest, nearest_soft
+from softgrasp.lqr.constrained.rows import Limits, bends, both_ends, broken, follow, gap_rows, limit_rows, tail_level
+from softgrasp.lqr.constrained.separation import past, separate, supports
+from softgrasp.lqr.plant.checks import ControlError
+
+ROUNDS = 20  # of half-planes; four to eight are usual
+SETTLED = 2e-4  # of the cost of obstacles, between two rounds
+ROOM = 1.05  # of the bends of the last round that the next one keeps
+MOST_WAYS = 8  # sides of obstacles that are tried
+LONGEST = 4  # times the first horizon
+MOST_FOLLOWED = 5000  # intervals behind the horizon that are followed
+PRICE = 10.0  # of a metre inside an obstacle, over the mean cost of a metre of the way
+SLIGHT = 1e-10  # [m]: a slack that is rounding of the price
+TIGHT = 1e-9  # of the extent of the body [1]: a row so near to its bound holds the plan
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a plan has to do."""
+
+    start: Array  # x_0 of the reduced plant, from the target, (N,)
+    places: Array  # nodes of the body at the target [m], (nodes, 2)
+    u_bar: Array  # steady input at the target [N], (n_s,)
+    shapes: tuple[Shape, ...]  # obstacles
+    names: tuple[str, ...]  # of the obstacles
+    error: Array  # bound on what the reduced plant leaves out at every node [m], (nodes, 2)
+    clearance: float = 0.0  # distance to keep beyond that [m]
+    limits: Limits = field(default_factory=Limits)  # of the hand
+    penalty: float | None = None  # cost of a metre inside an obstacle [1/m]; None: :data:`PRICE` times that of the way
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Inputs that lead to the target past the obstacles."""
+
+    horizon: Horizon  # reduced plant and number of intervals
+    task: Task  # what it was made for
+    c: Array  # deviations from the gain of the grid, (n_s H,)
+    normals: Array  # of the half-plane of every obstacle and interval, (obstacles, H, 2)
+    slack: Array  # depth inside clearance and margin, by obstacle and interval [m], (obstacles, H)
+    bend: float  # largest bound on what a node that holds the plan does between two instants [m]
+    multiplier: float  # largest cost of a metre of one row [1/m]
+    active: tuple[int, ...]  # rows that hold the plan, empty where gaps are not kept
+    costs: tuple[float, ...]  # |c|^2 of the rounds
+    steps: int  # changes of the active set in all rounds
+    sides: tuple[int, ...]  # on which the obstacles on the way are passed, 1: left of it
+    tried: tuple[tuple[tuple[int, ...], float, float], ...]  # sides, cost |c|^2 and largest slack of every way
+    untried: int  # ways that were not tried
+    gap: float  # least certified gap to the clearance, at every time of horizon and tail [m]; inf without obstacles
+    followed: int  # intervals behind the horizon that were followed under u = K x
+    unsafe: int  # intervals that the horizon needs more to be safe behind it; 0 where it is
+
+    @property
+    def certified(self) -> bool:
+        """Whether the full linear plant keeps every gap for ever, in exact arithmetic and time."""
+        return not self.reason
+
+    @property
+    def reason(self) -> str:
+        """Why it is not certified; empty where it is."""
+        if self.slack.max(initial=0.0) > 0 and not self.gap >= 0:
+            return f"the body is inside clearance and margin for {self.outside:.4g} s, {self.depth:.3g} m at most"
+        if not self.gap >= 0:
+            return f"between two instants the body may come {-self.gap:.2g} m nearer than the clearance"
+        if self.unsafe:
+            return f"behind the horizon of {self.horizon.steps} intervals the body or the hand may break its limits"
+        return ""
+
+    @property
+    def depth(self) -> float:
+        """Largest depth inside clearance and margin [m]."""
+        return float(self.slack.max(initial=0.0))
+
+    @property
+    def outside(self) -> float:
+        """Time of the intervals that have an instant inside clearance and margin [s]."""
+        return self.horizon.plant.grid * int((self.slack > 0).any(axis=0).sum())
+
+    @property
+    def inputs(self) -> Array:
+        """Inputs u of every interval [N], (H, n_s)."""
+        return self.horizon.input(self.task.start, self.c) + self.task.u_bar
+
+    @property
+    def free_cost(self) -> float:
+        """x_0'P x_0, the cost of held inputs without obstacles and limits."""
+        return float(self.task.start @ self.horizon.plant.P @ self.task.start)
+
+    @property
+    def cost(self) -> float:
+        """J of the reduced plant, for ever."""
+        return self.free_cost + float(self.c @ self.c)
+
+    def body(self) -> Array:
+        """Places of the nodes at all instants [m], (H, parts + 1, nodes, 2)."""
+        return places(self.horizon, self.task, self.c)
+
+
+def places(horizon: Horizon, task: Task, c: Array) -> Array:
+    """Nodes of the reduced plant at all instants of a plan [m], (H, parts + 1, nodes, 2)."""
+    return np.asarray(task.places + np.einsum("jdn,kin->kijd", horizon.plant.Y, horizon.state(task.start, c)))
+
+
+def make_plan(plant: HeldPlant, task: Task, steps: int, longest: int | None = None) -> Plan:
+    """The cheapest plan of all ways that are tried, on a horizon that is made longer until the tail is safe.
+
+    Args:
+        plant: reduced plant on the grid.
+        task: start, obstacles and limits.
+        steps: intervals of the first horizon.
+        longest: intervals of the last one; None for :data:`LONGEST` times the first.
+
+    Raises ControlError: the target keeps no gap or limit, or the limits of the hand cannot be kept.
+    """
+    level = tail_level(plant, _at_target(task), task.limits, task.u_bar)
+    if not level > 0:
+        raise ControlError("the target holds the hand beyond its own limit of force; raise control.constraints.force")
+    longest = LONGEST * steps if longest is None else longest
+    while True:
+        plan = _cheapest(Horizon(plant, steps), task, level)
+        if not plan.unsafe or steps >= longest:
+            return plan
+        steps = min(longest, steps + plan.unsafe)
+
+
+def _at_target(task: Task) -> list[tuple[Array, Array]]:
+    """Normal and free way of every node at the target; raises ControlError where there is none."""
+    result = []
+    for shape, name in zip(task.shapes, task.names, strict=True):
+        normal, gap = separate(shape, task.places)
+        free = _free(shape, task, normal[None])[0]
+        if not free.min() > 0:
+            need = gap - float(free.min())
+            raise ControlError(
+                f"at the target the body stands {gap:.4g} m off obstacle {name}; a plan needs more than {need:.4g} m "
+                "there, clearance and the bound of the reduced plant; move motion.target or raise control.constraints.N"
+            )
+        result.append((normal, free))
+    return result
+
+
+def _free(shape: Shape, task: Task, normals: Array) -> Array:
+    """Way of every node at the target to the half-planes of an obstacle, less clearance and margin, (count, nodes)."""
+    off = normals @ task.places.T - supports(shape, normals)[:, None]
+    return np.asarray(off - task.clearance - np.abs(normals) @ task.error.T)
+
+
+def _cheapest(horizon: Horizon, task: Task, level: float) -> Plan:
+    """All sides of the obstacles on the way."""
+    free = places(horizon, task, np.zeros(horizon.plant.n_s * horizon.steps))
+    first = [_normals(shape, free) for shape in task.shapes]
+    moving = [i for i, shape in enumerate(task.shapes) if not isinstance(shape, HalfSpace)]
+    on_way = [i for i in moving if _left(task.shapes[i], task, first[i], free).min() < 0]
+    way, still = free[:, 0].mean(axis=1), task.places - task.places.mean(axis=0)
+    ways = list(product((1, -1), repeat=len(on_way)))
+    plans: list[Plan] = []
+    for sides in ways[:MOST_WAYS]:
+        normals = list(first)
+        for i, side in zip(on_way, sides, strict=True):
+            normals[i] = past(task.shapes[i], way, still, side)
+        plans.append(_rounds(horizon, task, np.array(normals).reshape(-1, horizon.steps, 2), level, sides))
+    best = min(plans, key=lambda p: (p.depth > 0, p.depth if p.depth > 0 else float(p.c @ p.c)))
+    tried = tuple((p.sides, float(p.c @ p.c), p.depth) for p in plans)
+    return replace(best, tried=tried, untried=len(ways) - len(plans))
+
+
+def _left(shape: Shape, task: Task, normals: Array, body: Array) -> Array:
+    """What clearance and margin leave of the gap of every node at all instants, (H, parts + 1, nodes)."""
+    return np.asarray(_free(shape, task, normals)[:, None] + np.einsum("kd,kijd->kij", normals, body - task.places))
+
+
+def _normals(shape: Shape, body: Array) -> Array:
+    """Of the half-planes that keep the body of every interval farthest off, (H, 2)."""
+    return np.array([separate(shape, at.reshape(-1, 2))[0] for at in body])
+
+
+def _rounds(horizon: Horizon, task: Task, normals: Array, level: float, sides: tuple[int, ...]) -> Plan:
+    """Half-planes, plan, half-planes from the plan, until nothing changes."""
+    c, best = np.zeros(horizon.plant.n_s * horizon.steps), None
+    active: tuple[int, ...] = ()
+    hard = limit_rows(horizon, task.start, task.limits, task.u_bar)
+    costs: list[float] = []
+    steps = 0
+    for _ in range(ROUNDS):
+        G, h, group = _rows(horizon, task, normals, c)
+        c, slack, multipliers, active, more = _solve(G, h, group, hard, active, _price(horizon, task))
+        steps, slack = steps + more, slack.reshape(len(normals), -1)
+        costs.append(float(c @ c))
+        plan = _judged(horizon, task, c, normals, slack, multipliers, level)
+        plan = replace(plan, active=active, sides=sides)
+        if best is None or _better(plan, best):
+            best = plan
+        if len(costs) > 1 and abs(costs[-1] - costs[-2]) <= SETTLED * costs[-1] and (plan.gap >= 0 or plan.depth > 0):
+            break
+        body = plan.body()
+        normals = np.array([_normals(s, body) for s in task.shapes]).reshape(-1, horizon.steps, 2)
+    assert best is not None
+    return replace(best, costs=tuple(costs), steps=steps)
+
+
+def quadratic_program(plan: Plan) -> tuple[Array, Array]:
+    """G c <= h of all gaps and limits with the half-planes and the bends of a plan: one more round."""
+    G, h, _ = _rows(plan.horizon, plan.task, plan.normals, plan.c)
+    task = plan.task
+    hard = limit_rows(plan.horizon, task.start, task.limits, task.u_bar)
+    return np.vstack([G, hard[0]]), np.concatenate([h, hard[1]])
+
+
+def _better(plan: Plan, other: Plan) -> bool:
+    """Certified gaps first, then less depth, then less cost."""
+    return (not plan.gap >= 0, plan.depth, float(plan.c @ plan.c)) <= (
+        not other.gap >= 0, other.depth, float(other.c @ other.c),
+    )  # fmt: skip
+
+
+def _price(horizon: Horizon, task: Task) -> float:
+    """Of a metre inside an obstacle [1/m]."""
+    if task.penalty is not None:
+        return task.penalty
+    way = float(np.linalg.norm(task.start[: horizon.plant.n_s]))
+    return PRICE * float(task.start @ horizon.plant.P @ task.start) / way
+
+
+def _rows(horizon: Horizon, task: Task, normals: Array, c: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Rows of all obstacles with room for the bends of the plan c, and the group of each: its obstacle and interval."""
+    rows, right = [np.zeros((0, len(c)))], [np.zeros(0)]
+    x, u = horizon.state(task.start, c), horizon.input(task.start, c)
+    for shape, n in zip(task.shapes, normals, strict=True):
+        margin = ROOM * both_ends(bends(horizon.plant, x, u, n))
+        G, h = gap_rows(horizon, task.start, n, _free(shape, task, n)[:, None] - margin)
+        rows.append(G)
+        right.append(h)
+    h = np.concatenate(right)
+    count = len(normals) * horizon.steps
+    group = np.repeat(np.arange(count), len(h) // max(count, 1))
+    return np.vstack(rows), h, group
+
+
+def _solve(
+    G: Array, h: Array, group: NDArray[np.int64], hard: tuple[Array, Array], active: tuple[int, ...], price: float
+) -> tuple[Array, Array, Array, tuple[int, ...], int]:
+    """Hard rows, and where no c keeps them soft ones: c, slack, multipliers, active rows, steps."""
+    count = int(group.max(initial=-1)) + 1
+    try:
+        found = nearest(np.vstack([G, hard[0]]), np.concatenate([h, hard[1]]), active)
+        return found.x, np.zeros(count), found.multipliers, found.active, found.steps
+    except InfeasibleError:
+        try:
+            soft = nearest_soft(G, h, group, hard, price)
+        except InfeasibleError:
+            raise ControlError(
+                "no plan keeps the limits of the hand; raise force, speed or jump of control.constraints"
+            ) from None
+        return soft.x, np.where(soft.slack > SLIGHT, soft.slack, 0.0), soft.multipliers, (), soft.steps
+
+
+def _judged(
+    horizon: Horizon, task: Task, c: Array, normals: Array, slack: Array, multipliers: Array, level: float
+) -> Plan:
+    """A plan with what is certain of it."""
+    plant, H = horizon.plant, horizon.steps
+    end = horizon.states[0][-1] @ task.start + horizon.states[1][-1] @ c
+    x, u = follow(plant, end, level, MOST_FOLLOWED)
+    x, u = np.concatenate([horizon.state(task.start, c), x]), np.concatenate([horizon.input(task.start, c), u])
+    body = task.places + np.einsum("jdn,kin->kijd", plant.Y, x)
+    unsafe = np.zeros(len(u), dtype=bool)
+    if len(u) - H == MOST_FOLLOWED:
+        unsafe[-1] = True
+    gap, bend = np.inf, 0.0
+    for shape, ahead, (normal, _) in zip(task.shapes, normals, _at_target(task), strict=True):
+        n = np.concatenate([ahead, np.tile(normal, (len(u) - H, 1))])
+        own = both_ends(bends(plant, x, u, n))
+        left = _left(shape, task, n, body) - own
+        gap = min(gap, float(left.min()))
+        unsafe |= (left < 0).any(axis=(1, 2))
+        holds = left[:H] <= (ROOM - 1) * own[:H] + TIGHT * float(np.ptp(task.places))
+        bend = max(bend, float(own[:H][holds].max(initial=0.0)))
+    unsafe |= broken(plant, x, u, task.limits, task.u_bar)
+    last = np.flatnonzero(unsafe[H:])
+    return Plan(
+        horizon, task, c, normals, slack, bend, float(multipliers.max(initial=0.0)), (),
+        (), 0, (), (), 0, gap, len(u) - H, 0 if len(last) == 0 else int(last[-1]) + 1,
+    )  # fmt: skip

@@ -1,0 +1,137 @@
+"""The tissue of a one-way plant in all its modes, and in a few shapes: static answers to the hand, then modes by cost.
+
+One-way the tissue hears the hand through its acceleration a = M_s^{-1} (u - u_bar) alone, in full and in reduced form:
+
+    eta'' + 2 delta eta' + omega^2 eta = -g a,    y_j = Y_j + q_s - q_bar + S_j eta
+
+for the place y_j of node j, Y_j at the target, eta = 0 in equilibrium, 2 delta = alpha + beta omega^2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array, rows_on_all
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
+
+INDEPENDENT = 1e-8  # of a column: what the others leave of it is rounding below
+
+
+@dataclass(frozen=True)
+class ModalTissue:
+    """eta'' + (alpha + beta omega^2) eta' + omega^2 eta = -g a."""
+
+    omega: Array  # natural frequencies [1/s], ascending, (k,)
+    alpha: float  # mass-proportional damping [1/s]
+    beta: float  # stiffness-proportional damping [s]
+    g: Array  # coupling to the hand, (k, n_s)
+    seen: Array  # S, displacement of the nodes in each mode, (nodes, d, k)
+    c: Array  # outputs of the modes, (p, k)
+
+    @property
+    def delta(self) -> Array:
+        """Decay of every mode without feedback [1/s], (k,)."""
+        return np.asarray((self.alpha + self.beta * self.omega**2) / 2)
+
+    def reduced(self, k: int) -> ModalTissue:
+        """K^{-1} G and modes in the order |c|^2 |g|^2 / (delta omega^2), as k modes of their own.
+
+        The static shapes make the answer to a constant acceleration exact.
+
+        Raises ControlError: there are no k shapes.
+        """
+        n, n_s = self.g.shape
+        if not n_s < k <= n:
+            raise ControlError(f"a plan needs {n_s + 1} to {n} shapes of the tissue, not {k}")
+        decay = np.maximum(self.delta, np.finfo(float).tiny)
+        cost = np.sum(self.c**2, axis=0) * np.sum(self.g**2, axis=1) / (decay * self.omega**2)
+        order = np.argsort(-cost, kind="stable")
+        static = self.g / self.omega[:, None] ** 2
+        shapes = np.linalg.qr(np.eye(n)[:, order[: k - n_s]])[0]
+        for column in (static / np.linalg.norm(static, axis=0)).T:  # those that the modes leave something of
+            for _ in range(2):
+                column = column - shapes @ (shapes.T @ column)
+            size = np.linalg.norm(column)
+            if size > INDEPENDENT:
+                shapes = np.column_stack([shapes, column / size])
+        squares, T = np.linalg.eigh(shapes.T @ (self.omega[:, None] ** 2 * shapes))
+        V = shapes @ T
+        return ModalTissue(np.sqrt(squares), self.alpha, self.beta, V.T @ self.g, self.seen @ V, self.c @ V)
+
+    def answer(self, a: Array, grid: float, parts: int) -> Array:
+        """Amplitudes eta at the instants of all intervals under accelerations held from rest, (H, parts + 1, k).
+
+        ``a``: acceleration u - u_bar over M_s of every interval [m/s2], (H, n_s).
+        """
+        root = np.sqrt((self.delta**2 - self.omega**2).astype(complex))
+        root = np.where(np.abs(root) < 1e-6 * self.omega, 1e-6 * self.omega, root)  # equal roots, moved by 1e-12
+        p, m = -self.delta + root, -self.delta - root
+        s = grid * np.arange(parts + 1)[:, None] / parts
+        slow, fast = np.exp(p * s), np.exp(m * s)
+        eta, rate = np.zeros(len(p)), np.zeros(len(p))
+        result = np.empty((len(a), parts + 1, len(p)))
+        for k, static in enumerate(-(a @ self.g.T) / self.omega**2):
+            first = (rate - m * (eta - static)) / (p - m)  # eta - static = first e^{ps} + second e^{ms}
+            second = eta - static - first
+            result[k] = (first * slow + second * fast).real + static
+            eta, rate = result[k, -1], (p * first * slow[-1] + m * second * fast[-1]).real
+        return result
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Nodes on the boundary of the body: those of the tissue, rank by rank, then those that the hand holds."""
+
+    rows: NDArray[np.int64]  # local tissue dofs of the free ones of this rank, (here, d)
+    first: int  # number among all free ones of the first of this rank
+    free: int  # number of free ones
+    nodes: Array  # places in the undeformed body [m], (nodes, d)
+
+
+def make_surface(layout: BlockLayout, free: np.ndarray, held: np.ndarray) -> Surface:
+    """From the flags of this rank's free and held nodes. Collective."""
+    d, comm, chosen = layout.dimension, layout.comm, np.flatnonzero(free)
+    counts = comm.allgather(len(chosen))
+    here = layout.held[held] if len(layout.held) else np.zeros((0, d))
+    nodes = np.vstack([rows_on_all(comm, layout.nodes[chosen]), rows_on_all(comm, here)])
+    rows = chosen[:, None] * d + np.arange(d)
+    return Surface(rows, sum(counts[: comm.rank]), sum(counts), nodes)
+
+
+def modal_tissue(problem: RiccatiProblem, surface: Surface) -> ModalTissue:
+    """All modes of the tissue of a plant. Collective.
+
+    Raises ControlError: the hand hears the tissue, the damping couples modes or drags in space, or there are too many
+    unknowns.
+    """
+    system, layout = problem.system, problem.layout
+    d = layout.dimension
+    reason = _not_planned(problem)
+    if reason:
+        raise ControlError(f"a plan past obstacles is made for {reason}")
+    plant = ModalLoop(problem, DENSE_LIMIT).plant
+    seen = np.zeros((len(surface.nodes), d, len(plant.omega)))
+    seen[: surface.free] = rows_on_all(layout.comm, plant.Phi[surface.rows])
+    return ModalTissue(plant.omega, system.damping.alpha, system.damping.beta, plant.g, seen, plant.c)
+
+
+def _not_planned(problem: RiccatiProblem) -> str:
+    """What a plan needs and this plant has not; empty where it has all."""
+    system, layout = problem.system, problem.layout
+    if layout.dimension != 2 or layout.order != 1:
+        return f"2D elements of order 1, whose edges stay straight; this scene has {layout.dimension}D, P{layout.order}"
+    if system.two_way or layout.n_s != layout.dimension:
+        return "a hand that neither turns nor feels the tissue; set effects.reaction and effects.rotation to false"
+    if system.points is not None:
+        return "the linear plant; leave out effects.finite_strain"
+    if system.damping.matrix is not None or system.damping.drag:
+        return "damping that is the same in all layers and acts against the hand"
+    if layout.n_e > DENSE_LIMIT:
+        return f"at most {DENSE_LIMIT} unknowns, all of whose modes enter the bound; this scene has {layout.n_e}"
+    return ""

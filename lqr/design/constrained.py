@@ -1,0 +1,171 @@
+"""The plan of a scene past its obstacles, and its run on the full plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.fem.obstacles import Obstacle, make_obstacles
+from softgrasp.fem.petsc import Array, on_root, total
+from softgrasp.lqr.constrained.horizon import held_plant
+from softgrasp.lqr.constrained.plan import Plan, Task, make_plan
+from softgrasp.lqr.constrained.pulse import PulseError
+from softgrasp.lqr.constrained.rows import Limits
+from softgrasp.lqr.constrained.run import PlanRuns, run_plan
+from softgrasp.lqr.constrained.tissue import Surface, make_surface, modal_tissue
+from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.design.scene import control_of, problem
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.problem import RiccatiProblem
+
+SETTLED = 5.0  # time constants of the hand alone that the first horizon lasts: 0.7 % of the way are left
+AT_REST = 1e-9  # of the body: a start so near to equilibrium is one
+
+
+@dataclass(frozen=True)
+class PlannedControl:
+    """What a scene's ``[control.constraints]`` asks for."""
+
+    plan: Plan
+    """The plan, made on the reduced plant."""
+    runs: PlanRuns
+    """Plan and optimal feedback on the full plant."""
+    surface: Surface
+    """Nodes of the body on its boundary."""
+    names: tuple[str, ...]
+    """Of the obstacles."""
+
+
+@dataclass(frozen=True)
+class PlanSizes:
+    """The quadratic program of the first horizon."""
+
+    N: int  # states of the reduced plant
+    intervals: int  # of the horizon
+    grid: float  # length of an interval [s]
+    variables: int  # forces of all intervals
+    rows: int  # gaps of all nodes at all instants, and limits
+
+
+def plan_control(design: Design, watch: Stopwatch, notify: Callable[[int, int], None] | None = None) -> PlannedControl:
+    """Plan past the obstacles of a scene, within its limits, and run it on the full plant. Collective.
+
+    Args:
+        design: the optimal feedback of the scene.
+        watch: records the seconds of "bound", "plan" and "plan run".
+        notify: called with the number of steps of the full plant done and in all.
+
+    Raises:
+        ControlError: the plant has no plan, the target keeps no gap or limit, or a key is missing.
+        SolverError: a solve of the full plant failed.
+    """
+    plant, obstacles = design.problem, fixed_obstacles(design.model)
+    given = control_of(design.model).constraints
+    assert given is not None
+    surface = _surface(design.model)
+    start = _at_rest(design)
+    with watch.stage("bound"):
+        tissue = modal_tissue(plant, surface)
+        reduced = tissue.reduced(given.N // 2 - plant.layout.n_s)
+        limits = _limits(design)
+        error = np.full(surface.nodes.shape, 0.0 if given.margin == "bound" else given.margin)
+        if given.margin == "bound":
+            most = np.abs(np.linalg.inv(plant.M_s)) @ (_force(limits) + np.abs(design.target.u))
+            pulses = PulseError(tissue, reduced, given.grid)
+            error = on_root(plant.layout.comm, lambda: pulses.bound(most))
+    with watch.stage("plan"):
+        on_grid = held_plant(plant, reduced, given.grid, given.parts)
+        begin = np.zeros(on_grid.N)
+        begin[: plant.layout.n_s] = start
+        shapes, names = tuple(o.shape for o in obstacles), tuple(o.name for o in obstacles)
+        penalty = None if given.penalty == "auto" else float(given.penalty)
+        target = _places(plant, surface, design)
+        task = Task(begin, target, design.target.u, shapes, names, error, given.clearance, limits, penalty)
+        steps = first_horizon(design.model, plant)
+        longest = None if given.horizon == "auto" else steps
+        plan = on_root(plant.layout.comm, lambda: make_plan(on_grid, task, steps, longest))
+    with watch.stage("plan run"):
+        runs = run_plan(plant, design.solution, plan, surface, tissue, design.start, design.target, 0.0, notify)
+    return PlannedControl(plan, runs, surface, names)
+
+
+def fixed_obstacles(model: Model) -> tuple[Obstacle, ...]:
+    """The obstacles of a scene. Raises ControlError: one of them moves."""
+    obstacles = make_obstacles(model.scene, model.system.layout.dimension)
+    for i, obstacle in enumerate(obstacles):
+        if obstacle.path is not None:
+            raise ControlError(
+                f"obstacle.{i}.path moves obstacle {obstacle.name}; a plan needs obstacles that are fixed"
+            )
+    return obstacles
+
+
+def first_horizon(model: Model, plant: RiccatiProblem) -> int:
+    """Intervals of the first horizon: those of the scene, or until the hand without tissue has settled."""
+    given = control_of(model).constraints
+    assert given is not None
+    if given.horizon != "auto":
+        return max(1, int(np.ceil(given.horizon / given.grid - 1e-9)))
+    n_s = plant.layout.n_s
+    A, B = np.eye(2 * n_s, k=n_s), np.vstack([np.zeros((n_s, n_s)), np.linalg.inv(plant.M_s)])
+    C = np.hstack([plant.C_s, np.zeros_like(plant.C_s)])
+    X = scipy.linalg.solve_continuous_are(A, B, C.T @ plant.Q @ C, plant.R)
+    slowest = -float(np.linalg.eigvals(A - B @ np.linalg.solve(plant.R, B.T @ X)).real.max())
+    return max(1, int(np.ceil(SETTLED / (slowest * given.grid))))
+
+
+def plan_sizes(model: Model) -> PlanSizes | None:
+    """Variables and rows of the plan before it is made; None where the scene has none. Collective."""
+    given = control_of(model).constraints
+    if given is None:
+        return None
+    plant = problem(model)
+    steps, n_s = first_horizon(model, plant), plant.layout.n_s
+    gaps = len(fixed_obstacles(model)) * (given.parts + 1) * len(_surface(model).nodes)
+    hand = 2 * n_s * sum(limit is not None for limit in (given.force, given.speed, given.jump))
+    return PlanSizes(given.N, steps, given.grid, n_s * steps, steps * (gaps + hand))
+
+
+def _surface(model: Model) -> Surface:
+    return make_surface(model.system.layout, *model.space.surface())
+
+
+def _at_rest(design: Design) -> Array:
+    """Start of the hand from its target; raises ControlError where the tissue does not start in equilibrium."""
+    off, layout = design.start - design.target.state, design.problem.layout
+    swing = float(total(layout.comm, np.array([off.z @ off.z + off.v_z @ off.v_z]))[0]) ** 0.5
+    if swing > AT_REST * layout.extent or off.v_s.any():
+        raise ControlError("a plan starts with the tissue in equilibrium; set time.start = 'equilibrium'")
+    return off.q_s
+
+
+def _limits(design: Design) -> Limits:
+    """Of the scene, one number per axis. Raises ControlError: their number does not fit."""
+    given, n_s = control_of(design.model).constraints, design.problem.layout.n_s
+    assert given is not None
+    if given.force is None and given.margin == "bound":
+        raise ControlError(
+            "control.constraints.force is missing; the bound of the reduced plant needs it, or give "
+            "control.constraints.margin in metres"
+        )
+    force = None if given.force is None else np.atleast_1d(np.asarray(given.force, dtype=np.float64))
+    if force is not None and len(force) not in (1, n_s):
+        raise ControlError(f"control.constraints.force has {len(force)} numbers; give one, or {n_s}, one per axis")
+    return Limits(None if force is None else np.broadcast_to(force, (n_s,)).copy(), given.speed, given.jump)
+
+
+def _force(limits: Limits) -> Array:
+    assert limits.force is not None
+    return limits.force
+
+
+def _places(plant: RiccatiProblem, surface: Surface, design: Design) -> Array:
+    """Nodes of the boundary at the target [m], (nodes, d). Collective."""
+    state, d = design.target.state, plant.layout.dimension
+    z = np.zeros((len(surface.nodes), d))
+    z[surface.first : surface.first + len(surface.rows)] = state.z[surface.rows]
+    return np.asarray(surface.nodes + state.q_s[:d] + total(plant.layout.comm, z))

@@ -1,0 +1,1 @@
+"""The part of ``softgrasp control`` about plans past obstacles."""

@@ -1,0 +1,119 @@
+"""Figures of a plan: body and obstacles at some instants, gaps, forces and speed over time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.patches import Circle, Polygon
+from scipy.spatial import ConvexHull, cKDTree
+
+from softgrasp.fem.columns import AXES
+from softgrasp.fem.fields.picture import PictureMesh
+from softgrasp.fem.obstacles import Ball, HalfSpace, Polytope, Shape
+from softgrasp.fem.petsc import Array
+from softgrasp.lqr.design.constrained import PlannedControl
+from softgrasp.study.control.obstacle.result import PlannedStudy
+from softgrasp.study.pictures import style
+
+SHOWN = (0.0, 0.12, 0.28, 0.45, 0.62, 0.8, 1.0)  # shares of the way at which the body is drawn
+MANY = 2000  # points of a line; in print more of them coincide
+OBSTACLE: dict[str, Any] = {"facecolor": "#d9d9d9", "edgecolor": style.OUTLINE, "lw": 0.8, "zorder": 0.5}
+LIMIT: dict[str, Any] = {"color": "#999999", "lw": 0.8, "ls": (0, (4, 2))}
+
+
+def draw_plan(study: PlannedStudy, picture: PictureMesh | None, out: Path) -> list[Path]:
+    """All figures of a plan. Rank 0 only."""
+    files = list(figure_gaps(study.planned, out / "gaps.png"))
+    if picture is not None:
+        files += figure_bodies(study.planned, picture, out / "obstacle.png")
+    return files
+
+
+def figure_bodies(planned: PlannedControl, picture: PictureMesh, out_png: Path) -> tuple[Path, ...]:
+    """The boundary of the body at some instants under the plan and under the optimal feedback; PNG and PDF."""
+    runs, nodes = planned.runs, planned.surface.nodes
+    edges = cKDTree(nodes).query(picture.points[picture.facets])[1]
+    centre = runs.planned.body.mean(axis=1)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centre, axis=0), axis=1))])
+    instants = [int(np.searchsorted(way, share * way[-1])) for share in SHOWN]
+    lines, free = runs.planned.body, runs.free.body
+    low, high = lines.min(axis=(0, 1)), lines.max(axis=(0, 1))
+    room = 0.06 * (high - low).max()
+    box = np.array([low - room, high + room])
+    with style.paper_style():
+        width = style.WIDTH
+        figure, ax = plt.subplots(figsize=(width, width * (box[1, 1] - box[0, 1]) / (box[1, 0] - box[0, 0])))
+        for shape, name in zip(planned.plan.task.shapes, planned.names, strict=True):
+            _draw_obstacle(ax, shape, name, box)
+        worst = [int(runs.free.gaps[:, i].argmin()) for i in range(len(planned.names))]
+        for n in sorted(set(worst)):
+            ax.add_collection(
+                LineCollection(free[n][edges], colors="#888888", lw=0.9, linestyles=(0, (4, 2)), zorder=2)
+            )
+        colours = style.colour_map()(np.linspace(0.15, 1.0, len(instants)))
+        for colour, n in zip(colours, instants, strict=True):
+            ax.add_collection(LineCollection(lines[n][edges], colors=[colour], lw=1.3, zorder=3))
+            x, y = centre[n]
+            ax.text(x, y, f"{runs.planned.times[n]:.3g} s", ha="center", va="center", fontsize=7)
+        ax.plot(*centre[:: max(1, len(centre) // MANY)].T, color=style.HAND, lw=0.7, ls=(0, (1, 1.2)), zorder=2)
+        ax.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal", xlabel="$x$ [m]", ylabel="$y$ [m]")
+        return style.save(figure, out_png)
+
+
+def _draw_obstacle(ax: Any, shape: Shape, name: str, box: Array) -> None:
+    """Filled, as far as it lies in the picture."""
+    if isinstance(shape, Ball):
+        ax.add_patch(Circle(tuple(shape.center), shape.radius, **OBSTACLE))
+        place = shape.center
+    elif isinstance(shape, Polytope):
+        corners = shape.corners[ConvexHull(shape.corners).vertices]
+        ax.add_patch(Polygon(corners, **OBSTACLE))
+        place = corners.mean(axis=0)
+    else:
+        assert isinstance(shape, HalfSpace)
+        along = np.array([-shape.normal[1], shape.normal[0]])
+        size = float(np.linalg.norm(box[1] - box[0]))
+        foot = box.mean(axis=0) + (shape.offset - box.mean(axis=0) @ shape.normal) * shape.normal
+        back = foot - size * shape.normal
+        ax.add_patch(
+            Polygon([foot - size * along, foot + size * along, back + size * along, back - size * along], **OBSTACLE)
+        )
+        place = np.clip(foot - 0.02 * size * shape.normal, box[0] + 0.05 * size, box[1] - 0.02 * size)
+    ax.text(*place, name, ha="center", va="center", fontsize=7, color=style.OUTLINE, clip_on=True)
+
+
+def figure_gaps(planned: PlannedControl, out_png: Path) -> tuple[Path, ...]:
+    """Gaps, forces and speed over time with margin and limits; PNG and PDF."""
+    run, task = planned.runs.planned, planned.plan.task
+    thin = slice(None, None, max(1, len(run.times) // MANY))
+    with style.paper_style():
+        figure, (gaps, force, speed) = plt.subplots(
+            3, 1, figsize=(style.WIDTH, 0.75 * style.WIDTH), sharex=True, layout="constrained"
+        )
+        margin = task.clearance + float(task.error.max(initial=0.0))
+        for i, name in enumerate(planned.names):
+            gaps.plot(run.times[thin], run.gaps[thin, i], color=style.CYCLE[i % 4], label=name)
+        if run.gaps.min(initial=1.0) > 0:
+            gaps.set_yscale("log")
+        else:  # within a millimetre the axis is linear
+            gaps.set_yscale("symlog", linthresh=1e-3)
+        gaps.axhline(margin, **LIMIT, label="clearance and margin")
+        gaps.set_ylabel("gap [m]")
+        gaps.legend(ncols=4, loc="upper right")
+        for j, axis in enumerate(AXES[: run.inputs.shape[1]]):
+            force.plot(
+                run.times[:-1][thin], run.inputs[thin, j], color=style.CYCLE[j], label=axis, drawstyle="steps-post"
+            )
+            speed.plot(run.times[thin], run.v_s[thin, j], color=style.CYCLE[j], label=axis)
+        for ax, limit in ((force, task.limits.force), (speed, task.limits.speed)):
+            for level in () if limit is None else np.unique(np.atleast_1d(limit)):
+                ax.axhline(level, **LIMIT)
+                ax.axhline(-level, **LIMIT)
+        force.set_ylabel("force on the hand [N]")
+        speed.set(xlabel="$t$ [s]", ylabel="speed of the hand [m/s]")
+        force.legend(ncols=2, loc="upper right")
+        return style.save(figure, out_png)

@@ -1,0 +1,115 @@
+"""The part of a page about a plan: what it keeps, what it costs, what it took."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.columns import AXES
+from softgrasp.lqr.constrained.plan import Plan
+from softgrasp.study.control.obstacle.result import PlannedStudy
+from softgrasp.study.report.page import Section, captioned
+from softgrasp.study.report.tables import Table, listed
+
+CAPTIONS = {
+    "obstacle.png": "The boundary of the body on the full plant under the plan, and the way of its middle; grey and "
+    "dashed: under the optimal feedback, which knows no obstacle, where it is deepest inside.",
+    "gaps.png": "Gap of the body to every obstacle on the full plant, with the margin of the plan; force and speed "
+    "of the hand with their limits.",
+}
+GAPS = ("obstacle", "least gap [m]", "at [s]", "without the plan [m]")
+
+
+def plan_sections(study: PlannedStudy, drawn: Sequence[Path]) -> list[Section]:
+    """Gaps, margins and costs with the pictures."""
+    runs = study.planned.runs
+    gaps = [
+        (name, least, at, free)
+        for name, least, at, free in zip(
+            study.planned.names, runs.planned.least.tolist(), runs.planned.times_least.tolist(),
+            runs.free.least.tolist(), strict=True,
+        )
+    ]  # fmt: skip
+    parts = [Section("Plan", sentence(study), rows=facts(study), figures=captioned(drawn, CAPTIONS), terminal=True)]
+    if gaps:
+        text = (
+            f"Distance of body and obstacle on the full plant at every step of {1e3 * runs.dt:g} ms; negative: overlap."
+        )
+        parts.append(Section("Gaps", text, header=GAPS, rows=gaps, terminal=True))
+    return parts
+
+
+def plan_table(study: PlannedStudy) -> Table:
+    """Force of every interval, and the hand and the least gaps of the full plant in it."""
+    run, grid = study.planned.runs.planned, study.planned.plan.horizon.plant.grid
+    each = round(grid / study.planned.runs.dt)
+    axes = AXES[: run.inputs.shape[1]]
+    header = ["t [s]", *(f"u_{x} [N]" for x in axes), *(f"v_{x} [m/s]" for x in axes)]
+    gaps = [run.gaps[n : n + each + 1].min(axis=0) for n in range(0, len(run.inputs), each)]
+    rows = np.column_stack([run.times[:-1:each], run.inputs[::each], run.v_s[:-1:each], np.array(gaps)])
+    names = [f"least gap to {name} [m]" for name in study.planned.names]
+    return Table((*header, *names), rows.tolist(), "Plan")
+
+
+def sentence(study: PlannedStudy) -> str:
+    """What came out."""
+    plan = study.planned.plan
+    cost = f"It costs {study.excess:.2%} more than the optimal feedback without obstacles and limits."
+    if plan.certified:
+        return f"The full linear plant keeps every gap and limit under the plan at every time: this is proved. {cost}"
+    run = "keeps" if study.kept else "does not keep"
+    return f"The plan is not certified: {plan.reason}. The full plant {run} every gap in its run. {cost}"
+
+
+def facts(study: PlannedStudy) -> list[tuple[str, str]]:
+    """Label and text."""
+    plan, runs = study.planned.plan, study.planned.runs
+    task, plant = plan.task, plan.horizon.plant
+    rows: list[tuple[str, Any]] = [
+        ("reduced plant", f"N = {plant.N}, forces held for {plant.grid:g} s"),
+        ("horizon", f"{plan.horizon.steps} intervals, {plan.followed} more followed until the rest is safe"),
+        ("quadratic program", f"{len(plan.c)} variables, {study.rows} rows, {_held(plan)}"),
+    ]
+    if task.shapes:
+        rows += [
+            (
+                "margin for the reduced plant",
+                f"{task.error.max():.3g} m, its error in this plan {runs.reduction_error:.2g} m",
+            ),
+            ("margin between two instants", f"{plan.bend:.2g} m where a gap holds the plan"),
+            ("clearance", f"{task.clearance:.3g} m"),
+            ("error of the run's own step", f"{runs.step_error:.2g} m, measured against the exact modes"),
+            ("cost of a metre of one row", f"{plan.multiplier:.3g} at most"),
+        ]
+    rows += [
+        ("excess cost", f"{study.excess:.3%}, of which held forces {study.excess_held:.3%}"),
+        ("cost predicted and run", f"{plan.cost:.6g} and {runs.planned.cost:.6g}"),
+        ("largest force", listed([f"{x:.3g} N" for x in np.abs(runs.planned.inputs).max(axis=0)])),
+        ("largest speed", listed([f"{x:.3g} m/s" for x in np.abs(runs.planned.v_s).max(axis=0)])),
+        ("rounds and steps of the active set", f"{len(plan.costs)} and {plan.steps} on the way that was chosen"),
+    ]
+    if len(plan.tried) > 1:
+        ways = [f"{words(sides)} {_cost(cost, depth)}" for sides, cost, depth in plan.tried]
+        more = f"; {plan.untried} more ways were not tried" if plan.untried else ""
+        rows.append(("ways tried", "; ".join(ways) + more))
+    if plan.active:
+        cold, warm = (1e3 * float(np.median(x)) for x in (study.seconds_cold, study.seconds_warm))
+        rows.append(("time of the quadratic program", f"{cold:.2g} ms, from a plan nearby {warm:.2g} ms, in Python"))
+    return rows
+
+
+def _held(plan: Plan) -> str:
+    """How many rows hold a plan, or that they are exceeded."""
+    return f"{len(plan.active)} of them hold the plan" if plan.depth == 0 else "no forces keep all of them"
+
+
+def words(sides: Sequence[int]) -> str:
+    """On which sides the obstacles on the way are passed."""
+    return ", ".join("left" if side > 0 else "right" for side in sides)
+
+
+def _cost(cost: float, depth: float) -> str:
+    return f"costs {cost:.4g} more" if depth == 0 else f"goes {depth:.3g} m inside"

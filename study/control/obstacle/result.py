@@ -1,0 +1,82 @@
+"""What ``softgrasp control`` finds of a plan, and its part of result.json."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from softgrasp.lqr.design.constrained import PlannedControl
+
+
+@dataclass(frozen=True)
+class PlannedStudy:
+    """A plan, its runs on the full plant, and what it took."""
+
+    planned: PlannedControl  # plan and runs
+    optimal_cost: float  # least cost J* of all inputs without obstacles and limits
+    rows: int  # of the quadratic program
+    seconds_cold: tuple[float, ...]  # time of the quadratic program without a guess [s]
+    seconds_warm: tuple[float, ...]  # time of it from the rows that hold its solution [s]
+
+    @property
+    def excess(self) -> float:
+        """Cost of the plan on the full plant over the least cost, less one [1]."""
+        return self.planned.runs.planned.cost / self.optimal_cost - 1
+
+    @property
+    def excess_held(self) -> float:
+        """The part of it that holding the force over the grid costs without obstacles and limits [1]."""
+        return self.planned.plan.free_cost / self.optimal_cost - 1
+
+    @property
+    def kept(self) -> bool:
+        """Whether the full plant keeps every gap at every step."""
+        return bool((self.planned.runs.planned.gaps >= 0).all())
+
+    def result(self) -> dict[str, Any]:
+        """The key "obstacle" of ``result.json``."""
+        plan, runs = self.planned.plan, self.planned.runs
+        task, plant = plan.task, plan.horizon.plant
+        used = np.abs(runs.planned.inputs).max(axis=0)
+        return {
+            "names": list(self.planned.names),
+            "gap_min": runs.planned.least.tolist(),
+            "time": runs.planned.times_least.tolist(),
+            "gap_min_without_plan": runs.free.least.tolist(),
+            "margin": {
+                "clearance": task.clearance,
+                "reduced_plant": float(task.error.max(initial=0.0)),
+                "between_instants": plan.bend,
+            },
+            "error_of_reduced_plant": runs.reduction_error,
+            "error_of_run_step": runs.step_error,
+            "certified": plan.certified,
+            "reason": plan.reason,
+            "gap_certified": plan.gap if np.isfinite(plan.gap) else None,
+            "depth": plan.depth,
+            "time_outside": plan.outside,
+            "cost": runs.planned.cost,
+            "cost_predicted": plan.cost,
+            "cost_excess": self.excess,
+            "cost_excess_held": self.excess_held,
+            "multiplier": plan.multiplier,
+            "input_largest": used.tolist(),
+            "speed_largest": np.abs(runs.planned.v_s).max(axis=0).tolist(),
+            "N": plant.N,
+            "grid": plant.grid,
+            "intervals": plan.horizon.steps,
+            "intervals_followed": plan.followed,
+            "variables": len(plan.c),
+            "rows": self.rows,
+            "rows_active": len(plan.active),
+            "rounds": len(plan.costs),
+            "steps": plan.steps,
+            "ways": [{"sides": list(s), "cost": cost, "depth": depth} for s, cost, depth in plan.tried],
+            "ways_untried": plan.untried,
+            "inputs": plan.inputs.tolist(),
+            "dt": runs.dt,
+            "time_cold": [float(np.median(self.seconds_cold)), max(self.seconds_cold)],
+            "time_warm": [float(np.median(self.seconds_warm)), max(self.seconds_warm)],
+        }

@@ -1,0 +1,59 @@
+"""What a run would cost on other ranks: against a run, and by what must hold of any model."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import build
+from softgrasp.fem.run.forecast import RANKS, START, forecast, forecasts, told
+from softgrasp.fem.run.simulate import simulate
+from tests.helpers.models import make_scene
+
+BLOCK = ["tissue.refine=false", "tissue.order=2", "tissue.cells=[8, 6, 16]", "output.fields=none"]
+
+
+@pytest.mark.ranks
+def test_a_scene_is_told_for_its_own_ranks_and_others(comm: MPI.Intracomm) -> None:
+    model = build("block_3d", BLOCK, comm)
+    found = forecasts(model)
+    assert [f.ranks for f in found] == sorted({*RANKS, comm.size})
+    assert comm.allgather(found) == [found] * comm.size
+    seconds = [f.seconds for f in found]
+    assert seconds == sorted(seconds, reverse=True), "21 177 unknowns gain from 128 ranks yet"
+    assert [f.memory for f in found] == sorted(f.memory for f in found)
+    text = told(found)
+    assert all(f" on {f.ranks}" in text for f in found)
+    parts = found[0]
+    assert parts.seconds == START + parts.build + parts.setup + parts.equilibrium + parts.steps
+    assert parts.fields == 0, "no field files are asked for"
+
+
+def test_nothing_is_told_at_finite_strain(comm: MPI.Intracomm) -> None:
+    model = build(make_scene(effects={"finite_strain": {}}), comm=comm)
+    assert forecasts(model) == ()
+    assert told(()) == ""
+
+
+def test_growth_and_small_runs() -> None:
+    """A start of its own, then at least like n; a small run gains nothing by ranks."""
+    scene = make_scene()
+    small, large, larger = (forecast(scene, n, 2, n, 1) for n in (1_000, 100_000, 400_000))
+    assert small.seconds < 1.2 * START
+    assert larger.build == 4 * large.build
+    assert 4 <= larger.steps / large.steps < 4**1.6  # the solver changes between them
+    assert forecast(scene, 1_000, 2, 1_000, 128).seconds > 0.9 * small.seconds
+
+
+@pytest.mark.slow
+@pytest.mark.serial
+@pytest.mark.parametrize("solver", ["mumps", "stars"])
+def test_a_run_takes_what_is_told(solver: str) -> None:
+    """Within a factor of three: caches and clocks of machines differ, and what else runs."""
+    begin = time.process_time()
+    model = build("block_3d", [*BLOCK, f"time.solver={solver}"])
+    simulate(model)
+    spent, expected = time.process_time() - begin, forecasts(model)[0]
+    assert (expected.seconds - START) / 3 < spent < 3 * (expected.seconds - START)

@@ -1,0 +1,43 @@
+"""Gap and separating half-plane of a body and an obstacle against a scan over all directions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from softgrasp.fem.obstacles.shapes import Ball, HalfSpace, Polytope, Shape
+from softgrasp.lqr.constrained.separation import past, separate, supports
+
+FAN = np.column_stack([f(np.linspace(0, 2 * np.pi, 20_000)) for f in (np.cos, np.sin)])
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [Ball(np.array([0.3, 0.2]), 0.4), Polytope.box(np.zeros(2), np.array([0.5, 1.0])),
+     Polytope.hull(np.array([[0.0, 0.0], [1.0, 0.2], [0.3, 0.9]]))],
+)  # fmt: skip
+def test_gap_is_the_best_of_all_directions(shape: Shape) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        body = rng.uniform(-1.5, 1.5, 2) + 0.6 * rng.standard_normal((12, 2))
+        normal, gap = separate(shape, body)
+        scanned = ((FAN @ body.T).min(axis=1) - supports(shape, FAN)).max()
+        assert scanned <= gap + 1e-12  # rounding
+        assert gap <= scanned + 1e-3  # the fan is 3e-4 rad wide
+        assert np.isclose((body @ normal).min() - shape.support(normal), gap, atol=1e-12)
+
+
+def test_half_space_has_its_own_normal() -> None:
+    body = np.array([[0.0, 0.0], [1.0, 0.5], [0.2, 1.0]])
+    normal, gap = separate(HalfSpace(np.array([-1.0, 0.0]), -1.25), body)
+    assert np.array_equal(normal, [-1.0, 0.0])
+    assert gap == 0.25
+
+
+def test_normals_turn_over_the_side_that_is_asked_for() -> None:
+    way = np.linspace([0.0, 0.0], [10.0, 0.0], 21)
+    body = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    shape = Ball(np.array([5.0, 0.0]), 1.0)
+    left, right = past(shape, way, body, 1), past(shape, way, body, -1)
+    assert np.allclose(left[0], [-1, 0]) and np.allclose(left[-1], [1, 0])  # noqa: PT018
+    assert np.allclose(left[10], [0, 1]) and np.allclose(right[10], [0, -1])  # noqa: PT018

@@ -1,0 +1,100 @@
+"""``softgrasp control`` past obstacles: what result.json, page and files say, what is refused, and what off costs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from softgrasp.fem.errors import SceneError, SoftgraspError
+from softgrasp.fem.model.build import Stopwatch, build
+from softgrasp.fem.scene.file import load_scene
+from softgrasp.lqr.design.constrained import plan_sizes
+from softgrasp.lqr.design.feedback import design
+from softgrasp.study.control.obstacle.measure import planned_study
+from softgrasp.study.control.run import run_control
+
+SMALL = [
+    "tissue.cells=[4,8]",
+    "control.N=[8]",
+    "output.fields='none'",
+    "output.frames=2",
+    "time.steps=60",
+    "time.end=60.0",
+]
+
+
+def control(out: Path, *overrides: str, pictures: bool = False) -> tuple[dict, str]:
+    text = io.StringIO()
+    run_control(Path("paper_obstacle"), out, [*SMALL, *overrides], Console(file=text, width=160), quiet=True,
+                pictures=pictures)  # fmt: skip
+    return json.loads((out / "result.json").read_text()), text.getvalue()
+
+
+def test_page_files_and_numbers_agree(tmp_path: Path) -> None:
+    result, text = control(tmp_path, pictures=True)
+    found = result["obstacle"]
+    assert found["certified"]
+    assert found["names"] == ["disc", "wall"]
+    assert min(found["gap_min"]) >= 0
+    assert max(found["gap_min_without_plan"]) < -0.1  # LQR goes through both
+    assert found["cost_excess_held"] < found["cost_excess"] < 0.04
+    assert abs(found["cost"] / found["cost_predicted"] - 1) < 1e-5  # error of the reduced plant and of the steps
+    assert max(found["input_largest"]) <= 8
+    assert "keeps every gap and limit under the plan at every time: this is proved" in " ".join(text.split())
+    rows = list(csv.DictReader((tmp_path / "plan.csv").open()))
+    assert len(rows) == found["intervals"]
+    assert np.allclose([[float(row["u_x [N]"]), float(row["u_y [N]"])] for row in rows], found["inputs"], atol=1e-12)
+    assert min(float(row["least gap to wall [m]"]) for row in rows) == found["gap_min"][1]
+    for name in ("obstacle.png", "gaps.png"):
+        assert (tmp_path / name).stat().st_size > 10_000
+    page = (tmp_path / "report.html").read_text()
+    assert "knows no obstacle" in page
+
+
+def test_explain_names_the_program_that_control_solves() -> None:
+    overrides = [*SMALL, "control.constraints.horizon=34", "control.constraints.margin=1e-3"]
+    model = build(load_scene("paper_obstacle", overrides))
+    found = planned_study(design(model), Stopwatch(model.system.layout.comm), lambda *_: None).result()
+    sizes = plan_sizes(model)
+    assert sizes is not None
+    for key in ("N", "grid", "intervals", "variables", "rows"):
+        assert getattr(sizes, key) == found[key]
+    assert found["margin"]["reduced_plant"] == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("override", "sentence"),
+    [
+        ("control.constraints.force=false", "control.constraints.force"),
+        ("control.constraints.force=[1.0, 1.0, 1.0]", "force has 3 numbers; give one, or 2, one per axis"),
+        ("obstacle.1.offset=-5.99", "at the target the body stands -0.01 m off obstacle wall"),
+        ("obstacle.0.path={velocity=[0.1, 0.0]}", "obstacle.0.path moves obstacle disc"),
+        ("effects.reaction=true", "a plan past obstacles is made for a hand that neither turns nor feels the tissue"),
+        ("effects.gravity=[0, -0.1]", "a plan starts with the tissue in equilibrium"),
+        ("control.constraints.N=9", "N is 9; displacements and velocities come in pairs"),
+        ("control.constraints=false", "obstacle is given but nothing in this scene uses it"),
+    ],
+)
+def test_what_has_no_plan_is_refused_in_a_sentence(override: str, sentence: str, tmp_path: Path) -> None:
+    with pytest.raises((SoftgraspError, SceneError)) as error:
+        control(tmp_path, override)
+    assert sentence in str(error.value)
+    assert not (tmp_path / "result.json").exists()
+
+
+def test_a_scene_without_the_table_imports_no_plan(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from rich.console import Console;"
+        "from softgrasp.study.control.run import run_control;"
+        f"run_control(Path('paper_lqr'), Path(sys.argv[1]), {SMALL}, Console(quiet=True), quiet=True, pictures=False);"
+        "sys.exit(any('constrained' in name or 'control.obstacle' in name for name in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code, tmp_path / "out"], check=False).returncode == 0
