@@ -106,7 +106,7 @@ class ResidualNorms:
         return float(max(max(pair) for pair in self._ratios(materials)) ** 0.5)
 
     def _ratios(self, materials: tuple[LayerMaterial, ...]) -> list[tuple[float, float]]:
-        """mu and mu + d lambda / 2 of each layer over those of the reference [1]."""
+        """Ratios of mu and of mu + d lambda / 2 of each layer to those of the reference [1]."""
         half = self.dimension / 2
         pairs = zip(materials, self.reference, strict=True)
         return [(m.mu / r.mu, (m.mu + half * m.lam) / (r.mu + half * r.lam)) for m, r in pairs]
