@@ -56,7 +56,7 @@ class AnswerCost:
     cells: int  # of the short side
     answer: str
     ms: float  # CPU time
-    plain: float | None = None  # the same without the proof [ms]
+    plain: float | None = None  # CPU time without the proof [ms]
     share: float | None = None  # of the proof in it
     stepped: float | None = None  # the reduced run in state space [ms]
     of_stepped: float | None = None  # proof over that

@@ -60,15 +60,13 @@ class ForwardCost:
     drift: float  # of the energy after drift_steps
     drift_steps: int
     residual: float
-    # memory_mb, memory_base_mb: peak of all ranks, and that of the libraries [MiB]
-    memory_mb: float
-    memory_base_mb: float
+    memory_mb: float  # peak of all ranks [MiB]
+    memory_base_mb: float  # peak of all ranks by the libraries alone [MiB]
     repeats: int
     steps_per_repeat: int
     samples_us: dict[str, list[float]] = field(default_factory=dict)
-    # ratio, ratio_own: median of a TS step over the bare solves, PETSc's and those of the step
-    ratio: float | None = None
-    ratio_own: float | None = None
+    ratio: float | None = None  # median of a TS step over PETSc's bare solves
+    ratio_own: float | None = None  # median of a TS step over its own bare solves
     factor_peer_s: dict[str, float] = field(default_factory=dict)
     whole: WholeRun | None = None
 

@@ -48,17 +48,14 @@ class MeshRow:
 
     cells: int  # of the short side
     n_e: int  # tissue unknowns
-    # time_factor, time_full: factorisation and all steps of the full run
-    time_factor: float
-    time_full: float
+    time_factor: float  # factorisation of the full run
+    time_full: float  # all steps of the full run
     time_offline: float  # basis and projection
-    # time_setup, time_online: of the reduced model
-    time_setup: float
-    time_online: float
+    time_setup: float  # new parameter of the reduced model
+    time_online: float  # run of the reduced model
     N: int  # its dimension
-    # error, error_deformation: see softgrasp.study.reduce.linear.result.Point
-    error: float
-    error_deformation: float
+    error: float  # |X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e]
+    error_deformation: float  # |X - X_r|_F / |X|_F of X = [z, v_z]
     stable: bool  # of the reduced model
 
 

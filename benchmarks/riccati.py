@@ -89,13 +89,12 @@ class SolverPoint:
     rank: int  # of Z
     residual: float  # relative, recomputed from Z
     gain_difference: float | None  # relative, to the gain of the first method
-    tissue_difference: float | None  # the same of the tissue's rows alone
+    tissue_difference: float | None  # relative, of the tissue's rows alone, to the gain of the first method
     split: dict[str, float] = field(default_factory=dict)  # seconds by stage
     solves: int = 0
     newton_steps: int = 0
-    # memory_mb, memory_base_mb: peak of all ranks, and that before the first method [MiB]
-    memory_mb: float = 0.0
-    memory_base_mb: float = 0.0
+    memory_mb: float = 0.0  # peak of all ranks [MiB]
+    memory_base_mb: float = 0.0  # peak of all ranks before the first method [MiB]
 
 
 Rows = list[SolverPoint | Failure]
@@ -218,9 +217,8 @@ class Record:
 
     file: Path  # bench_riccati.json
     beta: float  # Kelvin-Voigt time of all rows [s]
-    # rows, peers: what is measured
-    rows: Rows = field(default_factory=list)
-    peers: Rows = field(default_factory=list)
+    rows: Rows = field(default_factory=list)  # of the methods here
+    peers: Rows = field(default_factory=list)  # of other codes
 
     @property
     def points(self) -> list[SolverPoint]:

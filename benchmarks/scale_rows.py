@@ -42,7 +42,7 @@ class ScaleCost:
     seconds: dict[str, float]  # of each stage [s]
     modelled: dict[str, float]  # of each stage [s]
     memory_mb: float  # peak of all ranks [MiB]
-    memory_modelled_mb: float  # the same by the model [MiB]
+    memory_modelled_mb: float  # peak of all ranks by the cost model [MiB]
     memory_base_mb: float  # memory of the libraries alone, of all ranks [MiB]
     balance: dict[str, float]  # operations of the slowest rank over those of one rank's share, by stage [1]
     flops: dict[str, float]  # operations of all ranks by stage [1]

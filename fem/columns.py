@@ -56,6 +56,11 @@ def labels(columns: Sequence[OutputColumn]) -> tuple[str, ...]:
     return tuple(column.label for column in columns)
 
 
+def hand_of(n_s: int, outputs: Sequence[str]) -> Columns:
+    """The hand's degrees of freedom where only the labels of the outputs tell whether it moves in space."""
+    return hand_columns(n_s, 3 if n_s == 6 or any(name.endswith("_z") for name in outputs) else 2)
+
+
 def hand_columns(n_s: int, dimension: int, name: str = "hand") -> Columns:
     """The hand's degrees of freedom: x, y (z), then the rotations rz in the plane, rx, ry, rz in space."""
     turns = TURNS[2:] if dimension == 2 else TURNS

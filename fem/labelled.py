@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.columns import Array, Columns, hand_columns
+from softgrasp.fem.columns import Array, Columns, hand_of
 from softgrasp.fem.errors import SoftgraspError
 
 
@@ -37,8 +37,7 @@ def package(name: str) -> Any:
 
 def of_hand(values: Array, names: Sequence[str], *, rate: str = "", load: bool = False) -> Quantity:
     """A quantity of the hand; the dimension is that of the outputs' names."""
-    solid = values.shape[1] == 6 or any(name.endswith("_z") for name in names)
-    return of_columns(values, hand_columns(values.shape[1], 3 if solid else 2), "hand", rate=rate, load=load)
+    return of_columns(values, hand_of(values.shape[1], names), "hand", rate=rate, load=load)
 
 
 def of_columns(values: Array, columns: Columns, dimension: str, *, rate: str = "", load: bool = False) -> Quantity:

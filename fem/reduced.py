@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.columns import TURNS, Columns, hand_columns
+from softgrasp.fem.columns import TURNS, Columns, hand_of
 from softgrasp.fem.errors import SoftgraspError, SolverError
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.shown import Card, Shown, drawn, listed
@@ -246,8 +246,7 @@ class ReducedSystem(StateSpace):
 
     @property
     def _hand(self) -> Columns:
-        space = self.n_s == 6 or any(name.endswith("_z") for name in self._labels)
-        return hand_columns(self.n_s, 3 if space else 2, "hand")
+        return hand_of(self.n_s, self._labels)
 
     def to_control(self) -> Any:
         """The system as ``control.StateSpace`` with named inputs, states and outputs.

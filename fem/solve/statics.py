@@ -10,8 +10,8 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.scene.scene import Time
-from softgrasp.fem.solve.solvers import Reproducible, SolverName, choose_solver, make_solver
-from softgrasp.fem.solve.stiffness import static_columns
+from softgrasp.fem.solve.solvers import SolverName, choose_solver, make_solver
+from softgrasp.fem.solve.stiffness import factored_stiffness
 from softgrasp.fem.system import BlockSystem
 
 if TYPE_CHECKING:
@@ -32,20 +32,13 @@ def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Tim
         return np.zeros(system.layout.n_local)
     if system.points is not None:
         return finite_equilibrium(system, solver)
-    load, where = (system.G @ system.gravity)[:, None], "the static equilibrium"
-    repeat = "auto" if time is None else time.reproducible
-    return static_columns(system, load, where, solver=solver, reproducible=repeat)[:, 0]
+    load = (system.G @ system.gravity)[:, None]
+    with factored_stiffness(system, solver, reproducible="auto" if time is None else time.reproducible) as factor:
+        return factor.columns(load, "the static equilibrium")[:, 0]
 
 
 def solve_columns(
-    A: PETSc.Mat,
-    layout: BlockLayout,
-    X: Array,
-    where: str = "the inner product",
-    rtol: float = 1e-12,
-    *,
-    solver: SolverName | None = None,
-    reproducible: Reproducible = "auto",
+    A: PETSc.Mat, layout: BlockLayout, X: Array, where: str = "the inner product", rtol: float = 1e-12
 ) -> Array:
     """Return the local rows (n_local, k) of A^-1 X, A symmetric positive definite, Fortran order. Collective.
 
@@ -54,8 +47,7 @@ def solve_columns(
     ``rtol``: of cg, where no direct solver fits. Raises SolverError: the factorisation fails, or the solution has a
     large residual.
     """
-    name = solver or choose_solver(layout, few=True)[0]
-    static = make_solver(A.copy(), name, layout, "softgrasp_static_", rtol, reproducible)
+    static = make_solver(A.copy(), choose_solver(layout, few=True)[0], layout, "softgrasp_static_", rtol)
     try:
         return static.columns(X, where)
     finally:

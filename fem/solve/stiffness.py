@@ -62,18 +62,10 @@ def factored_stiffness(
         made.destroy()
 
 
-def static_columns(
-    system: BlockSystem,
-    X: Array,
-    where: str = "the static solution",
-    rtol: float = 1e-12,
-    *,
-    solver: SolverName | None = None,
-    reproducible: Reproducible = "auto",
-) -> Array:
+def static_columns(system: BlockSystem, X: Array) -> Array:
     """K_ee^-1 X of local rows (n_local, k), Fortran order; columns of zeros cost nothing. Collective.
 
     Raises SolverError: the factorisation fails, or the solution has a large residual.
     """
-    with factored_stiffness(system, solver, rtol, reproducible) as factor:
-        return factor.columns(X, where)
+    with factored_stiffness(system) as factor:
+        return factor.columns(X, "the static solution")

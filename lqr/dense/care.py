@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array, Complex
+from softgrasp.fem.reduced import StateSpace
 from softgrasp.lqr.plant.checks import EPS, ControlError, check_finite, check_weights, square_root
 
 NEWTON_STEPS = 6  # two are enough after a Schur form; more means that nothing is gained any more
@@ -19,21 +20,12 @@ FAST_BACKWARD = 1e-12  # relative to all four terms, where P is so large that C'
 UNSEEN = 1e4 * EPS
 
 
-@dataclass(frozen=True)
-class StateSpace:
-    """E x' = A x + B u, y = C x, dense, with the weights of y'Qy + u'Ru."""
+@dataclass(frozen=True, repr=False)
+class WeightedSystem(StateSpace):
+    """E x' = A x + B u, y = C x with the weights of the cost, the integral of y'Qy + u'Ru."""
 
-    E: Array  # descriptor matrix, regular, (N, N)
-    A: Array  # state matrix, (N, N)
-    B: Array  # input matrix, (N, m)
-    C: Array  # output matrix, (p, N)
     Q: Array  # weight of the outputs, (p, p)
     R: Array  # weight of the inputs, (m, m)
-
-    @property
-    def N(self) -> int:
-        """Order."""
-        return len(self.A)
 
 
 @dataclass(frozen=True)
@@ -98,7 +90,7 @@ def care(A: Array, B: Array, C: Array, Q: Array, R: Array, E: Array | None = Non
     return DenseSolution(Y, K, poles, relative, size / (parts or 1.0), steps)
 
 
-def care_of(space: StateSpace) -> DenseSolution:
+def care_of(space: WeightedSystem) -> DenseSolution:
     """See :func:`care`. Raises ControlError: there is no stabilising solution."""
     return care(space.A, space.B, space.C, space.Q, space.R, space.E)
 
@@ -307,7 +299,7 @@ def _unseen(hidden: list[complex]) -> str:
     )
 
 
-def solve_reduced(space: StateSpace) -> Array:
+def solve_reduced(space: WeightedSystem) -> Array:
     """P of E'PA + A'PE - E'PB R^{-1} B'PE + C'QC = 0, (N, N), in well below a millisecond for a small N.
 
     The Hamiltonian matrix, scaled by one number so that its off-diagonal blocks have like size, is brought to ordered
@@ -318,7 +310,7 @@ def solve_reduced(space: StateSpace) -> Array:
     return care_of(space).X if P is None else P
 
 
-def fast_solution(m: StateSpace) -> Array | None:
+def fast_solution(m: WeightedSystem) -> Array | None:
     """P without balancing, or None when it is not accurate or not stabilising.
 
     Raises ControlError: see :func:`check_seen`.

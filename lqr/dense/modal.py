@@ -13,7 +13,7 @@ from softgrasp.fem.errors import ResourceError, SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, rows_on_root, times_columns, to_scipy, total
 from softgrasp.fem.solve.modes import lowest_modes
-from softgrasp.lqr.dense.care import StateSpace, care_of
+from softgrasp.lqr.dense.care import WeightedSystem, care_of
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, MODAL_KEY, ControlError, check_finite, check_weights, square_root
 from softgrasp.lqr.plant.gain import Gain
@@ -57,7 +57,7 @@ class ModalPlant:
     D: Array  # Phi' D_ee Phi, (k, k)
     g: Array  # Phi' G, (k, n_s); without a hand Phi' B_z, (k, m)
     c: Array  # outputs of the modes, (p, k)
-    space: StateSpace  # dense plant in the coordinates xi
+    space: WeightedSystem  # dense plant in the coordinates xi
 
 
 def gather_matrix(layout: BlockLayout, A: PETSc.Mat) -> Array | None:
@@ -79,7 +79,7 @@ def gather_tissue(problem: RiccatiProblem) -> TissueMatrices | None:
     return TissueMatrices(M, K, D, G, C_z, B_z)
 
 
-def assemble_space(problem: RiccatiProblem, tissue: TissueMatrices) -> StateSpace:
+def assemble_space(problem: RiccatiProblem, tissue: TissueMatrices) -> WeightedSystem:
     """E, A, B, C of x = [q_s, v_s, z, v_z].
 
     With drag = "space" and two-way coupling the hand row carries alpha M_rigid and alpha G' as well.
@@ -105,10 +105,10 @@ def assemble_space(problem: RiccatiProblem, tissue: TissueMatrices) -> StateSpac
         B[w] = B_z
     C_z = tissue.C_z.T
     C = np.hstack([problem.C_s, np.zeros_like(problem.C_s), C_z, np.zeros_like(C_z)])
-    return StateSpace(E, A, B, C, problem.Q, problem.R)
+    return WeightedSystem(E, A, B, C, problem.Q, problem.R)
 
 
-def relative_space(problem: RiccatiProblem) -> StateSpace | None:
+def relative_space(problem: RiccatiProblem) -> WeightedSystem | None:
     """E, A, B, C in hand-relative coordinates, dense on rank 0, None elsewhere. Collective."""
     tissue = gather_tissue(problem)
     return None if tissue is None else assemble_space(problem, tissue)
@@ -124,7 +124,7 @@ def modal_plant(
     return ModalPlant(omega, Phi, massed, D, g, c, in_energy(space, omega))
 
 
-def in_energy(space: StateSpace, omega: Array) -> StateSpace:
+def in_energy(space: WeightedSystem, omega: Array) -> WeightedSystem:
     """L E S, L A S, B, C S with S = blkdiag(I, 1/omega, I), L = blkdiag(I, omega, I), of [q_s, v_s, eta, eta']."""
     k = len(omega)
     L = np.concatenate([np.ones(len(space.E) - 2 * k), omega, np.ones(k)])
@@ -274,7 +274,7 @@ def factor_psd(X: Array) -> Array:
     return np.asarray(Z @ right[sigma > FACTOR_TOLERANCE * sigma[0]].T)
 
 
-def dense_residual(problem: RiccatiProblem, space: StateSpace, Z: Array) -> float:
+def dense_residual(problem: RiccatiProblem, space: WeightedSystem, Z: Array) -> float:
     """||A'XE + E'XA - E'XB R^{-1} B'XE + C'QC||_2 / ||C'QC||_2 for X = Z Z'."""
     moved, driven = space.E.T @ Z, space.A.T @ Z
     gain = moved @ (Z.T @ space.B)

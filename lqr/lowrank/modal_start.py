@@ -10,7 +10,14 @@ import scipy.linalg
 from softgrasp.fem.petsc import Array, PETSc, on_root, total
 from softgrasp.fem.solve.modes import KEPT_ENTRIES, lowest_modes
 from softgrasp.fem.system import BlockSystem
-from softgrasp.lqr.dense.care import FAST_RESIDUAL, StateSpace, fast_solution, lyapunov, riccati_residual, solve_reduced
+from softgrasp.lqr.dense.care import (
+    FAST_RESIDUAL,
+    WeightedSystem,
+    fast_solution,
+    lyapunov,
+    riccati_residual,
+    solve_reduced,
+)
 from softgrasp.lqr.dense.modal import TissueMatrices, assemble_space, in_energy
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
@@ -74,7 +81,7 @@ def _floating(plant: Plant, k: int) -> tuple[Array, Array]:
         shell.destroy()
 
 
-def restrict(plant: Plant, V: Array, omega: Array, M_V: Array) -> StateSpace:
+def restrict(plant: Plant, V: Array, omega: Array, M_V: Array) -> WeightedSystem:
     """Galerkin projection on z = V eta with V' K_ee V = diag(omega^2), in [q_s, v_s, omega eta, eta']. Collective."""
     r = len(omega)
     columns = [M_V, damp(plant.system, V, M_V), plant.G, plant.C_z]
@@ -91,7 +98,7 @@ def restrict(plant: Plant, V: Array, omega: Array, M_V: Array) -> StateSpace:
     return replace(space, B=B, Q=np.eye(len(space.C)), R=np.eye(plant.inputs))
 
 
-def solve_small(plant: Plant, space: StateSpace, guess: Array | None = None) -> Array:
+def solve_small(plant: Plant, space: WeightedSystem, guess: Array | None = None) -> Array:
     """X of a restricted plant, (N, N), solved on rank 0. Collective.
 
     ``guess``: an X near the solution, (N, N). Raises ControlError: not stabilisable or not detectable.
@@ -105,7 +112,7 @@ def solve_small(plant: Plant, space: StateSpace, guess: Array | None = None) -> 
     return on_root(plant.comm, solve)
 
 
-def _few_modes(m: StateSpace, r: int) -> Array | None:
+def _few_modes(m: WeightedSystem, r: int) -> Array | None:
     """X of the lowest of r modes alone, zero for the others; None where all are few.
 
     With the two Newton steps that follow it takes a third of the time of one Schur form for all modes.
@@ -122,7 +129,7 @@ def _few_modes(m: StateSpace, r: int) -> Array | None:
     return X
 
 
-def _corrected(space: StateSpace, X: Array) -> Array | None:
+def _corrected(space: WeightedSystem, X: Array) -> Array | None:
     """Newton's method from a stabilising X near the solution; None when it is not."""
     n = len(space.E)
     lu, pivots, info = scipy.linalg.lapack.dgetrf(space.E)
@@ -144,7 +151,7 @@ def _corrected(space: StateSpace, X: Array) -> Array | None:
     return None
 
 
-def _ordered(space: StateSpace, s: int, gain: Array) -> np.ndarray:
+def _ordered(space: WeightedSystem, s: int, gain: Array) -> np.ndarray:
     """Closed-loop poles by |c_k|^2 / (|Re p_k| omega_k^2), what a mode adds to the cost; s freedoms of the hand."""
     poles, vectors = np.linalg.eig(np.linalg.solve(space.E, space.A - space.B @ gain))
     kinetic = np.real(np.einsum("ij,ij->j", vectors.conj(), space.E @ vectors))

@@ -9,7 +9,7 @@ import numpy as np
 
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
-from softgrasp.lqr.dense.care import StateSpace, solve_reduced
+from softgrasp.lqr.dense.care import WeightedSystem, solve_reduced
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
@@ -57,7 +57,7 @@ class Retuner:
             result += m.mu * (mu[0] + m.beta * mu[1]) + m.lam * (lam[0] + m.beta * lam[1])
         return result
 
-    def at(self, materials: Materials) -> StateSpace:
+    def at(self, materials: Materials) -> WeightedSystem:
         """The reduced equation for other Lame constants and viscosities.
 
         Raises ControlError: the number of layers or a density differs from the reference.

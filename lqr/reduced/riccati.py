@@ -10,7 +10,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root, total
-from softgrasp.lqr.dense.care import StateSpace, solve_reduced
+from softgrasp.lqr.dense.care import WeightedSystem, solve_reduced
 from softgrasp.lqr.lowrank.compress import gram, triangular
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
@@ -40,7 +40,7 @@ class ReducedRiccati:
     """P_hat = V P_N V' and its gain."""
 
     basis: RiccatiBasis  # basis, scaled to energy
-    matrices: StateSpace  # E_N, A_N, B_N, C_N with the weights
+    matrices: WeightedSystem  # E_N, A_N, B_N, C_N with the weights
     P_N: Array  # solution of the reduced equation, (N, N)
     gain: Gain  # gain K_hat on the full plant
 
@@ -101,13 +101,13 @@ class GainReport(GainQuality):
     N: int  # order of the reduced equation
     error_P: float = NAN  # noqa: N815  ||P - P_hat||_F / ||P||_F in the paper's coordinates
     time_are: float = NAN  # time of one solution of the reduced equation, nan unless the caller measures it [s]
-    matrices: StateSpace | None = None  # reduced equation; None where it is not kept
+    matrices: WeightedSystem | None = None  # reduced equation; None where it is not kept
 
 
-def project_plant(problem: RiccatiProblem, basis: RiccatiBasis) -> StateSpace:
+def project_plant(problem: RiccatiProblem, basis: RiccatiBasis) -> WeightedSystem:
     """E_N = W'EU, A_N = W'AU, B_N = W'B, C_N = CU. Collective."""
     comm, W, U = problem.layout.comm, basis.W, basis.U
-    return StateSpace(
+    return WeightedSystem(
         E=gram(comm, W, descriptor(problem, U)),
         A=gram(comm, W, dynamics(problem, U)),
         B=np.ascontiguousarray(inputs_adjoint(problem, W).T),

@@ -68,7 +68,7 @@ def force_of_motion(scene: Scene, model: Model) -> Force:
     return force
 
 
-class Experiments:
+class SwitchRuns:
     """Runs of one scene with any set of its effects on, each made once. Collective.
 
     Where a control problem lets a force move the hand that the run moves by itself, every run has a second one under

@@ -27,7 +27,7 @@ from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.solvers import ITERATIVE
-from softgrasp.study.effects.result import Cost, OffProof
+from softgrasp.study.effects.result import Cost, ZeroCostCheck
 from softgrasp.study.effects.switch import neutral
 from softgrasp.study.shell.timing import RepeatableRun, interleave, medians, rotated
 
@@ -89,7 +89,7 @@ def matrix_memory(A: PETSc.Mat) -> float:
     return float(entries * (8 + integer / block) + integer * (A.getSize()[0] + 1))
 
 
-def holdings(model: Model, run: Run) -> dict[str, float]:
+def memory_by_object(model: Model, run: Run) -> dict[str, float]:
     """Memory of each matrix, vector and array that model and run hold, over all ranks [byte]. Collective.
 
     Found by looking through the objects, so that nothing an effect allocates can be forgotten. Views count once; what
@@ -181,7 +181,7 @@ def measure_steps(comm: MPI.Intracomm, cases: dict[str, MeasuredScene], repeats:
         for name, case in cases.items():
             case.flops = steppers[name].flops()
             case.prints = operator_hashes(case.model, steppers[name].run)
-            case.bytes = holdings(case.model, steppers[name].run)
+            case.bytes = memory_by_object(case.model, steppers[name].run)
     finally:
         for stepper in steppers.values():
             stepper.destroy()
@@ -282,7 +282,7 @@ def difference(more: dict[str, int], less: dict[str, int]) -> dict[str, int]:
     return {name: d for name in sorted({*more, *less}) if (d := more.get(name, 0) - less.get(name, 0))}
 
 
-def prove_off(name: str, before: MeasuredScene, again: MeasuredScene) -> OffProof:
+def check_zero_cost(name: str, before: MeasuredScene, again: MeasuredScene) -> ZeroCostCheck:
     """Compare the scene before and after the effect was on in this process. Collective."""
     layout = before.model.system.layout
     prints, counts = [again.prints], [(again.objects, again.objects_in_steps)]
@@ -294,7 +294,7 @@ def prove_off(name: str, before: MeasuredScene, again: MeasuredScene) -> OffProo
         run.midpoint.destroy()
         if before.objects:
             counts.append(objects_of(layout.comm, with_zero, before.mesh))
-    return OffProof(
+    return ZeroCostCheck(
         same_operators=all(p == before.prints for p in prints),
         same_objects=not before.objects_in_steps and all(c == (before.objects, {}) for c in counts),
         same_work=again.flops == before.flops,

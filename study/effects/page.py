@@ -83,8 +83,9 @@ def compose(study: EffectsStudy, scene: Scene, session: Session) -> Page:
     files = figure_effects(study.tried, study.tolerance, study.noise_quartiles, session.out / "effects.png")
     sections = [Section("", figures=[(files[0], CAPTION)]), *parts(study)]
     return Page(
-        f"{scene.name}: effects", summary(study), sections, {"effects.csv": table_of(study.findings, CSV)}, files
-    )
+        f"{scene.name}: effects", summary(study), sections, {"effects.csv": table_of(study.findings, CSV)}, files,
+        warnings=study.warnings,
+    )  # fmt: skip
 
 
 def parts(study: EffectsStudy) -> list[Section]:
@@ -92,7 +93,7 @@ def parts(study: EffectsStudy) -> list[Section]:
     advice = [
         (f"{f.name}{'' if f.on else ', tried'}: {f.value}" if f.value else f.name, f.advice) for f in study.findings
     ]
-    advice += [("all together", in_company(study)), *(("warning", text) for text in study.warnings)]
+    advice.append(("all together", joint_changes(study)))
     base = study.base
     times = [f"{1e3 * base['assembly']:.2f} ms", f"{1e3 * base['setup']:.2f} ms", f"{1e6 * base['step']:.2f} us"]
     scene = ("the scene", *times, f"{base['flops']:.0f}", f"{base['memory'] / 1024:.0f} KiB", "")
@@ -131,7 +132,7 @@ def summary(study: EffectsStudy) -> list[str]:
     ]
 
 
-def in_company(study: EffectsStudy) -> str:
+def joint_changes(study: EffectsStudy) -> str:
     """What each effect changes beside all that are advised, one sentence."""
     parts = [
         f"{f.name} {percent(c.change.outputs)}"

@@ -20,7 +20,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Company:
+class JointChange:
     """One effect switched alone, all others as advised."""
 
     change: Change  # of the outputs of the run
@@ -65,7 +65,7 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class OffProof:
+class ZeroCostCheck:
     """What is counted to show that an effect that is off costs nothing; times are too noisy for it.
 
     Compared are the scene before the effect was tried, after it, and with the effect at strength zero, if it has one.
@@ -104,9 +104,9 @@ class EffectResult:
     advice: str  # one sentence
     change: Change | None = None  # of the outputs of the run when it is switched alone
     control: float | None = None  # change of the outputs when a force moves the hand [1]; None: not asked
-    company: Company | None = None  # change beside all other advised effects
+    company: JointChange | None = None  # change beside all other advised effects
     cost: Cost | None = None  # of having it on
-    proof: OffProof | None = None  # for an effect that is off
+    proof: ZeroCostCheck | None = None  # for an effect that is off
 
     @property
     def label(self) -> str:

@@ -18,7 +18,7 @@ from softgrasp.fem.errors import ResourceError, SolverError
 from softgrasp.fem.model.memory import free_bytes, size_text
 from softgrasp.fem.model.scales import rigid_inertia
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.effects.experiments import Experiments, check_elements
+from softgrasp.study.effects.experiments import SwitchRuns, check_elements
 from softgrasp.study.effects.measure import (
     AGAIN,
     SCENE,
@@ -33,7 +33,7 @@ from softgrasp.study.effects.page import compose
 from softgrasp.study.effects.result import EffectsStudy
 from softgrasp.study.effects.switch import Scales, switches
 from softgrasp.study.effects.together import Changes, advised
-from softgrasp.study.effects.verdict import find, shows
+from softgrasp.study.effects.verdict import assess, shows
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.shell.folder import folder_lock
@@ -74,7 +74,7 @@ def study_effects(
     cases = measure_builds(comm, scenes, repeats, tick, mesh)
     on = frozenset(s.name for s in effects if s.on)
     models = {on: cases[SCENE].model} | {on ^ {s.name}: cases[s.name].model for s in tried}
-    runs = Experiments(scene, scales, models, mesh)
+    runs = SwitchRuns(scene, scales, models, mesh)
     changes: Changes = {}
     for s in tried:
         try:
@@ -100,7 +100,7 @@ def study_effects(
     noise = max(TIMER, float(np.abs(ratio).max()))
     layout = model.system.layout
     return EffectsStudy(
-        findings=tuple(find(s, explanation, cases, changes, together, noise) for s in effects),
+        findings=tuple(assess(s, explanation, cases, changes, together, noise) for s in effects),
         advised=together.on,
         beside=together.beside,
         explanation=explanation,

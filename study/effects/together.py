@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import SolverError
-from softgrasp.study.effects.experiments import Experiments, Names
-from softgrasp.study.effects.result import Change, Company
+from softgrasp.study.effects.experiments import Names, SwitchRuns
+from softgrasp.study.effects.result import Change, JointChange
 
 Changes = dict[str, tuple[Change, float | None]]  # of the outputs, and under a force
 
@@ -22,17 +22,17 @@ class Rival(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Together:
+class JointAdvice:
     """All effects tried again."""
 
     on: tuple[str, ...]  # effects that are advised, those that cannot be tried as they are
     beside: tuple[str, ...]  # those of them that were on when the company of each was measured
-    company: dict[str, Company]  # of each effect that was tried
+    company: dict[str, JointChange]  # of each effect that was tried
     rivals: dict[str, Rival]  # effects that show, but give way to another
 
 
 class Shown(NamedTuple):
-    """What brings an effect out that does not show in the scene as it is; attributes as of :class:`Company`."""
+    """What brings an effect out that does not show in the scene as it is; attributes as of :class:`JointChange`."""
 
     partners: tuple[str, ...] = ()
     pair: bool = False
@@ -41,10 +41,10 @@ class Shown(NamedTuple):
     forced: bool = False
 
 
-Joined = dict[str, Shown]
+JointChanges = dict[str, Shown]
 
 
-def rivals_of(runs: Experiments, needed: Names, changes: Changes) -> dict[str, Rival]:
+def rivals_of(runs: SwitchRuns, needed: Names, changes: Changes) -> dict[str, Rival]:
     """Of the needed effects that the scene does not take together those that change less."""
     kept, rivals = runs.on, dict[str, Rival]()
     for name in sorted(needed - runs.on, key=lambda name: -changes[name][0].outputs):
@@ -56,7 +56,7 @@ def rivals_of(runs: Experiments, needed: Names, changes: Changes) -> dict[str, R
     return rivals
 
 
-def advised(runs: Experiments, needed: Names, changes: Changes) -> Together:
+def advised(runs: SwitchRuns, needed: Names, changes: Changes) -> JointAdvice:
     """Judge every effect that was tried again beside all that are advised. Collective.
 
     ``needed`` show in the scene as it is. Finite strain on trial comes last, with one run: beside other effects it is
@@ -76,7 +76,7 @@ def advised(runs: Experiments, needed: Names, changes: Changes) -> Together:
         company[name] = finite_strain_beside(runs, name, changes[name], on)
         if name in needed or company[name].partners:
             last = apart
-    return Together(_ordered(on | last), _ordered(on), company, rivals)
+    return JointAdvice(_ordered(on | last), _ordered(on), company, rivals)
 
 
 def _ordered(on: Names) -> tuple[str, ...]:
@@ -84,8 +84,8 @@ def _ordered(on: Names) -> tuple[str, ...]:
 
 
 def advised_together(
-    runs: Experiments, tried: tuple[str, ...], needed: Names, tolerance: float, later: Names = frozenset()
-) -> tuple[Names, dict[str, Company]]:
+    runs: SwitchRuns, tried: tuple[str, ...], needed: Names, tolerance: float, later: Names = frozenset()
+) -> tuple[Names, dict[str, JointChange]]:
     """Judge every effect again with all advised effects on, until no further one shows. Collective.
 
     An effect that does not show in the scene as it is joins when it shows beside those advised so far; then two that
@@ -93,12 +93,12 @@ def advised_together(
     advised without being on here, so nothing joins that the scene does not take beside them.
     """
     on = needed | (runs.on - frozenset(tried))
-    joined: Joined = {}
+    joined: JointChanges = {}
 
     def free(*names: str) -> bool:
         return on.isdisjoint(names) and not runs.refusal(on | frozenset(names) | later)
 
-    def next_ones() -> Joined:
+    def next_ones() -> JointChanges:
         return _singles(runs, tried, on, [name for name in tried if free(name)], tolerance) or _pair(
             runs, tried, on, [pair for pair in combinations(tried, 2) if free(*pair)], tolerance
         )
@@ -110,20 +110,20 @@ def advised_together(
     shut = [name for name in tried if name not in on and not runs.refusal(on | {name}) and not free(name)]
     joined |= _singles(runs, tried, on, shut, tolerance)
     return on, {
-        name: Company(runs.change(on, on ^ {name}), runs.control(on, on ^ {name}), *joined.get(name, Shown()))
+        name: JointChange(runs.change(on, on ^ {name}), runs.control(on, on ^ {name}), *joined.get(name, Shown()))
         for name in tried
         if not runs.refusal(on ^ {name})
     }
 
 
-def _switched(runs: Experiments, tried: tuple[str, ...], on: Names, but: Names) -> tuple[str, ...]:
+def _switched(runs: SwitchRuns, tried: tuple[str, ...], on: Names, but: Names) -> tuple[str, ...]:
     """What is switched in the scene as it is where these are on, apart from the effects in question."""
     return tuple(p for p in tried if p not in but and (p in on) != (p in runs.on))
 
 
-def _singles(runs: Experiments, tried: tuple[str, ...], on: Names, names: list[str], tolerance: float) -> Joined:
+def _singles(runs: SwitchRuns, tried: tuple[str, ...], on: Names, names: list[str], tolerance: float) -> JointChanges:
     """Effects that show beside those that are on, with a partner that brings them out, or all. Collective."""
-    joined: Joined = {}
+    joined: JointChanges = {}
     for name in names:
         if (change := runs.shows(on, on | {name}, tolerance)) is None:
             continue
@@ -137,8 +137,8 @@ def _singles(runs: Experiments, tried: tuple[str, ...], on: Names, names: list[s
 
 
 def _pair(
-    runs: Experiments, tried: tuple[str, ...], on: Names, pairs: list[tuple[str, str]], tolerance: float
-) -> Joined:
+    runs: SwitchRuns, tried: tuple[str, ...], on: Names, pairs: list[tuple[str, str]], tolerance: float
+) -> JointChanges:
     """The first two effects that show together and not one by one, one of them if both are on. Collective."""
     for a, b in pairs:
         if (change := runs.shows(on, on | {a, b}, tolerance)) is None:
@@ -151,14 +151,14 @@ def _pair(
     return {}
 
 
-def finite_strain_beside(runs: Experiments, name: str, alone: tuple[Change, float | None], on: Names) -> Company:
+def finite_strain_beside(runs: SwitchRuns, name: str, alone: tuple[Change, float | None], on: Names) -> JointChange:
     """Finite strain on trial beside all advised effects, one run more; alone where it fails there. Collective."""
     if on == runs.on or runs.refusal(on | {name}):
-        return Company(*alone)
+        return JointChange(*alone)
     try:
         change = runs.change(on, on | {name})
     except SolverError:
-        return Company(*alone)
+        return JointChange(*alone)
     if alone[0].outputs <= runs.scene.study.tolerance < change.outputs:
-        return Company(change, alone[1], tuple(sorted(on ^ runs.on)), together=change.outputs)
-    return Company(change, alone[1])
+        return JointChange(change, alone[1], tuple(sorted(on ^ runs.on)), together=change.outputs)
+    return JointChange(change, alone[1])

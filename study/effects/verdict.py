@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.effects.measure import AGAIN, SCENE, MeasuredScene, cost_of, prove_off
-from softgrasp.study.effects.result import Change, Company, Cost, EffectResult
+from softgrasp.study.effects.measure import AGAIN, SCENE, MeasuredScene, check_zero_cost, cost_of
+from softgrasp.study.effects.result import Change, Cost, EffectResult, JointChange
 from softgrasp.study.effects.switch import Switch
-from softgrasp.study.effects.together import Changes, Rival, Together
+from softgrasp.study.effects.together import Changes, JointAdvice, Rival
 from softgrasp.study.forward.explain import EffectReport, Explanation
 from softgrasp.study.report.tables import listed, percent
 
@@ -23,18 +23,18 @@ def verdict_of(change: float, controls: bool, costs: bool, tolerance: float) -> 
     return "wasted" if costs and not controls else "optional"
 
 
-def find(
+def assess(
     s: Switch,
     explanation: Explanation,
     cases: dict[str, MeasuredScene],
     changes: Changes,
-    together: Together,
+    together: JointAdvice,
     noise: float,
 ) -> EffectResult:
     """Judge one effect and say what to do about it. Collective."""
     scene = cases[SCENE].model.scene
     gate, tolerance = explanation.effects[s.name], scene.study.tolerance
-    proof = None if s.on else prove_off(s.name, cases[SCENE], cases[AGAIN])
+    proof = None if s.on else check_zero_cost(s.name, cases[SCENE], cases[AGAIN])
     if s.other is None:
         return EffectResult(s.name, s.on, s.value, gate, "not tried", f"Not tried: {s.reason}.", proof=proof)
     (change, control), company = changes[s.name], together.company.get(s.name)
@@ -88,7 +88,7 @@ def _advice(s: Switch, verdict: str, change: float, why: str, cost: Cost, tolera
     return f"{'Keep or drop it' if s.on else 'It is right to leave it off'}: it {little} and costs nothing in this run."
 
 
-def _advice_apart(rival: Rival, change: float, company: Company | None, changes: Changes, scene: Scene) -> str:
+def _advice_apart(rival: Rival, change: float, company: JointChange | None, changes: Changes, scene: Scene) -> str:
     """For an effect that shows, but cannot go with one that is advised."""
     more = f"{rival.name} by {changes[rival.name][0].outputs:.2g}, tolerance {scene.study.tolerance:g}; {rival.why}."
     begin = f"Switch it on only in place of {rival.name}, which is advised:"
@@ -99,7 +99,7 @@ def _advice_apart(rival: Rival, change: float, company: Company | None, changes:
     return f"{begin} {state} it would change the outputs by {company.together:.2g}{force}, {more}"
 
 
-def _advice_together(s: Switch, change: float, company: Company, scene: Scene) -> str:
+def _advice_together(s: Switch, change: float, company: JointChange, scene: Scene) -> str:
     """For an effect that shows only when others are switched too."""
     partners, on = listed(company.partners), [EFFECTS[name].active(scene) for name in company.partners]
     force = " when a force moves the hand, as in the control problem" if company.forced else ""

@@ -48,9 +48,8 @@ class HardCase:
 
     case: str  # what is special, in words
     x: float  # the varied number, the position in the picture
-    # here, textbook: what softgrasp and the textbook way gave
-    here: Outcome
-    textbook: Outcome
+    ours: Outcome  # result of softgrasp
+    reference: Outcome  # result of the textbook way
     bound: float | None  # the number from here must not exceed it; None when the case has to be refused
     reason: str  # where the bound comes from
     may_refuse: bool = False  # a refusal is as good as a number within the bound
@@ -59,11 +58,11 @@ class HardCase:
     @property
     def verdict(self) -> Verdict:
         """Within the bound, above it, or refused with a sentence. NaN is above every bound."""
-        if self.here.refused:
+        if self.ours.refused:
             return "refused"
-        if self.here.value is None or self.bound is None:
+        if self.ours.value is None or self.bound is None:
             return "fail"
-        return "pass" if self.here.value <= self.bound else "fail"
+        return "pass" if self.ours.value <= self.bound else "fail"
 
     @property
     def ok(self) -> bool:
@@ -76,7 +75,7 @@ class HardCase:
     def verdict_text(self) -> str:
         """The verdict with the sentence of a refusal."""
         if self.verdict == "refused":
-            return f"refused: {self.here.text}" if self.ok else f"fail, refused: {self.here.text}"
+            return f"refused: {self.ours.text}" if self.ok else f"fail, refused: {self.ours.text}"
         return self.verdict
 
     @property
@@ -91,7 +90,7 @@ class HardCase:
         return {
             "case": self.case, "x": self.x, "group": self.group, "bound": self.bound,
             "must_be_refused": self.bound is None, "may_be_refused": self.may_refuse, "reason": self.reason,
-            "ours": self.here, "plain": self.textbook, "verdict": self.verdict_text, "ok": self.ok,
+            "ours": self.ours, "plain": self.reference, "verdict": self.verdict_text, "ok": self.ok,
         }  # fmt: skip
 
 

@@ -46,9 +46,8 @@ class Query:
     scene: tuple[str, ...] = (KV,)  # overrides of the scene that the model is trained on
     at: tuple[float, float] = (60.0, 45.0)  # lambda and mu [Pa]
     motion: tuple[str, ...] = ()  # overrides of the question alone
-    # k, k2: modes of the answer, and of the basis that certifies it
-    k: int = 12
-    k2: int = 36
+    k: int = 12  # modes of the answer
+    k2: int = 36  # modes of the basis that certifies it
     refuse: bool = False  # the answer must be refused
 
 

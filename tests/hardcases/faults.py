@@ -32,7 +32,8 @@ contact = { sides = ["left", "right"], box = [[0.0, 1.5], [1.0, 2.0]] }
 hand = { mass = 20.0 }
 motion = { target = [5.0, 3.0] }
 time = { steps = 5 }
-control = { outputs = [{ kind = "node", point = [0.5, 0.0] }] }
+control = { outputs = [{ kind = "node", point = [0.5, 0.0] }], constraints = {} }
+obstacle = [{ kind = "disc", center = [9.0, 9.0], radius = 0.5 }]
 [effects]
 gravity = { g = [0.0, -9.0] }
 damping = { kind = "rayleigh", beta = 0.01, alpha = 0.4 }
@@ -128,7 +129,8 @@ EXCLUSIVE = (  # what excludes each other, overrides of SCENE
     ("facet marks of a structured box", ("contact.facet_tag=3",)),
     ("thickness in 3D", (
         "tissue.size=[1.0, 1.0, 2.0]", "tissue.cells=[1, 1, 2]", "tissue.thickness=0.5", "tissue.layers={}",
-        "contact={sides=['left']}", "motion.target=[1.0, 0.0, 0.0]", "effects.gravity=false", "control=false")),
+        "contact={sides=['left']}", "motion.target=[1.0, 0.0, 0.0]", "effects.gravity=false", "control=false",
+        "obstacle=false")),
 )  # fmt: skip
 
 

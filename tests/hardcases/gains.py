@@ -22,7 +22,7 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.dense.care import StateSpace, care, care_of, lyapunov
+from softgrasp.lqr.dense.care import WeightedSystem, care, care_of, lyapunov
 from softgrasp.lqr.dense.modal import ModalPlant, assemble_space, dense_modes, gather_tissue
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
@@ -36,7 +36,7 @@ NOTHING = 1e-20  # share of the whole gain below which a block is zero
 _exact: Any = np.frompyfunc(Decimal, 1, 1)  # a double is a decimal fraction; the conversion does not round
 
 
-def _spaces(problem: RiccatiProblem) -> tuple[StateSpace, ModalPlant]:
+def _spaces(problem: RiccatiProblem) -> tuple[WeightedSystem, ModalPlant]:
     """The plant relative to the hand, and in its modes. Raises ValueError: more than one rank."""
     tissue = gather_tissue(problem)
     if tissue is None:
@@ -44,7 +44,7 @@ def _spaces(problem: RiccatiProblem) -> tuple[StateSpace, ModalPlant]:
     return assemble_space(problem, tissue), dense_modes(problem, tissue)
 
 
-def _residual(space: StateSpace, X: Any) -> tuple[Any, Array]:
+def _residual(space: WeightedSystem, X: Any) -> tuple[Any, Array]:
     """K and A'XE + E'XA - K'RK + C'QC for a decimal X, in the digits of the context; the residual in doubles."""
     E, A, B, C, Q, R = (_exact(M) for M in (space.E, space.A, space.B, space.C, space.Q, space.R))
     moved = X @ E
@@ -114,7 +114,7 @@ class GainBounds:
     exact: Array  # gain, (m, states)
 
     @cached_property
-    def _plant(self) -> tuple[StateSpace, ModalPlant, Array]:
+    def _plant(self) -> tuple[WeightedSystem, ModalPlant, Array]:
         """The plant relative to the hand and in its modes xi, and S of x = S xi."""
         space, modal = _spaces(self.problem)
         one = np.eye(2 * self.problem.layout.n_s)

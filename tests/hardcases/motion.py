@@ -26,7 +26,7 @@ from softgrasp.fem.solve.statics import equilibrium
 from softgrasp.fem.strain.body import HyperelasticBody
 from softgrasp.fem.system import BlockSystem, Damping
 from tests.hardcases.cases import EPS, Family, HardCase, here, make, scaled_condition, textbook, thin
-from tests.hardcases.textbook import implicit_and_explicit, in_turn, textbook_midpoint
+from tests.hardcases.textbook import implicit_and_explicit, staggered, textbook_midpoint
 
 SMALL = ("tissue.cells=[3, 6]", "control=false")
 
@@ -145,7 +145,7 @@ def mass_rows(quick: bool) -> Iterator[HardCase]:
         model = make("paper_forward", *SMALL, *scene, f"time={{steps={steps}, end={dt * steps!r}}}")
         system = model.system
         operators = to_scipy(system.M_ee), to_scipy(system.K_ee), system.G, system.M_rigid, system.M_hand
-        turns = textbook(in_turn, *operators, push, dt, steps)
+        turns = textbook(staggered, *operators, push, dt, steps)
         reason = "without outer force the momentum is constant: ten sums and products a step, each rounded once"
         bound = 10 * steps * EPS
         yield HardCase(f"hand / tissue = {ratio:g}", ratio, here(_momentum_error, model, push), turns, bound, reason)

@@ -30,7 +30,7 @@ INTRO = (
 def cells_of(case: HardCase) -> tuple[str, str, str, str, str]:
     """Case, bound, the two outcomes and the verdict as text."""
     return (
-        case.case, case.bound_text, "" if case.here.refused else str(case.here), str(case.textbook), case.verdict_text,
+        case.case, case.bound_text, "" if case.ours.refused else str(case.ours), str(case.reference), case.verdict_text,
     )  # fmt: skip
 
 
@@ -49,13 +49,13 @@ def write_files(out: Path, result: HardCaseResult, family: str | None, pictures:
     figures = {
         f.family.name: figure_family(f.family, f.cases, out / f"hard_{f.family.name}.png")
         for f in result.families
-        if pictures and any(o.value is not None for case in f.cases for o in (case.here, case.textbook))
+        if pictures and any(o.value is not None for case in f.cases for o in (case.ours, case.reference))
     }
     options = (" --quick" if result.quick else "") + (f" --family {family}" if family else "")
     files = [write_json(out / "result.json", result.to_dict()), csv_table(result).write_csv(out / "hardcases.csv")]
     files += [file for pair in figures.values() for file in pair]
     cases = [case for f in result.families for case in f.cases]
-    kept = [c for c in cases if c.textbook.value is not None and (c.bound is None or c.textbook.value <= c.bound)]
+    kept = [c for c in cases if c.reference.value is not None and (c.bound is None or c.reference.value <= c.bound)]
     page = write_report(
         out / "report.html",
         title="Hard cases",
@@ -80,7 +80,7 @@ def csv_table(result: HardCaseResult) -> Table:
         for case in f.cases:
             name, bound, *texts = cells_of(case)
             first = f.family.name, bare_label(f.family.quantity), name, bound
-            rows.append((*first, case.here.value, case.textbook.value, *texts, case.reason, case.ok))
+            rows.append((*first, case.ours.value, case.reference.value, *texts, case.reason, case.ok))
     return Table((*header, "reason of the bound", "ok"), rows)
 
 
@@ -99,30 +99,30 @@ def sections(result: HardCaseResult, pictures: Mapping[str, Path]) -> list[Secti
             f"the bound; marks {beside}: refused, or no number."
         )
         figures = [(pictures[family.name], caption)] if family.name in pictures else []
-        table = Table(("case", "bound", "here", "textbook", "verdict"), [brief(case) for case in f.cases])
+        table = Table(("case", "bound", "here", "textbook", "verdict"), [short_row(case) for case in f.cases])
         parts.append(table.section(text, family.title, figures=figures))
-        texts = [line for case in f.cases for line in at_length(case)]
+        texts = [line for case in f.cases for line in long_rows(case)]
         if texts:
             parts.append(Section("", "Refusals and remarks in full:", rows=texts))
     return parts
 
 
-def brief(case: HardCase) -> tuple[str, str, str, str, str]:
-    """A case in few letters; `at_length` has the rest."""
+def short_row(case: HardCase) -> tuple[str, str, str, str, str]:
+    """A case in few letters; `long_rows` has the rest."""
     name, bound, here, textbook, _ = cells_of(case)
     verdict = case.verdict if case.ok else "fail, refused" if case.verdict == "refused" else "fail"
     if len(textbook) > WORDS:
-        value = case.textbook.value
-        textbook = case.textbook.error or (textbook if value is None else f"{value:.2g}")
+        value = case.reference.value
+        textbook = case.reference.error or (textbook if value is None else f"{value:.2g}")
     if len(here) > WORDS:
-        here = "no number" if case.here.value is None else f"{case.here.value:.2g}"
+        here = "no number" if case.ours.value is None else f"{case.ours.value:.2g}"
     return name, bound, here, textbook, verdict
 
 
-def at_length(case: HardCase) -> list[tuple[str, str]]:
-    """What `brief` has no room for: refusals, errors, remarks on a number; with the case and who said it."""
-    texts = [(f"{case.case}: here", case.here.text)] if case.here.refused or len(str(case.here)) > WORDS else []
-    return [*texts, *([(f"{case.case}: textbook", case.textbook.text)] if len(str(case.textbook)) > WORDS else [])]
+def long_rows(case: HardCase) -> list[tuple[str, str]]:
+    """What `short_row` has no room for: refusals, errors, remarks on a number; with the case and who said it."""
+    texts = [(f"{case.case}: here", case.ours.text)] if case.ours.refused or len(str(case.ours)) > WORDS else []
+    return [*texts, *([(f"{case.case}: textbook", case.reference.text)] if len(str(case.reference)) > WORDS else [])]
 
 
 # --- one picture a family: the ways against the bound
@@ -155,7 +155,7 @@ def _log(value: float) -> float:
 
 def _range(rows: Sequence[HardCase]) -> tuple[float, float]:
     """Decades that hold all numbers and bounds."""
-    values = [v for r in rows for o in (r.here, r.textbook) if math.isfinite(v := _drawn(o))]
+    values = [v for r in rows for o in (r.ours, r.reference) if math.isfinite(v := _drawn(o))]
     values += [_log(r.bound) for r in rows if r.bound is not None]
     return (min(values) - GAP, max(values) + GAP) if values else (-1.0, 1.0)
 
@@ -191,11 +191,11 @@ def _curves(family: Family, rows: Sequence[HardCase]) -> Any:
     marks: dict[str, Any] = {}
     groups = list(dict.fromkeys(r.group for r in rows))
     first = {r.x: r for r in reversed(rows)}
-    ways = [("textbook", family.textbook, sorted(first.values(), key=lambda r: r.x), ORANGE, "x", "-")]
+    ways = [("reference", family.textbook, sorted(first.values(), key=lambda r: r.x), ORANGE, "x", "-")]
     for k, group in enumerate(groups):
         own = sorted((r for r in rows if r.group == group), key=lambda r: r.x)
         name = f"here, {group}" if group else "here"
-        ways.append(("here", name, own, BLUE, "os"[k % 2], "-" if k == 0 else "--"))
+        ways.append(("ours", name, own, BLUE, "os"[k % 2], "-" if k == 0 else "--"))
     for way, name, own, colour, marker, line in ways:
         x = [at[r.x] for r in own]
         ax.plot(x, [_drawn(getattr(r, way)) for r in own], color=colour, marker=marker, ms=SIZE, lw=1.0, ls=line)
@@ -203,7 +203,8 @@ def _curves(family: Family, rows: Sequence[HardCase]) -> Any:
             outcome: Outcome = getattr(r, way)
             if math.isnan(_drawn(outcome)):
                 height = (
-                    lanes["refused" if outcome.refused else "no number"] + (0.12 if way == "textbook" else -0.12) * lane
+                    lanes["refused" if outcome.refused else "no number"]
+                    + (0.12 if way == "reference" else -0.12) * lane
                 )
                 ax.plot(at[r.x], height, marker, color=colour, ms=SIZE)
         marks[name] = Line2D([], [], color=colour, marker=marker, ms=SIZE, lw=1.0, ls=line)
@@ -230,7 +231,7 @@ def _curves(family: Family, rows: Sequence[HardCase]) -> Any:
 def _listed(family: Family, rows: Sequence[HardCase]) -> Any:
     """One line a case; numbers to the right, on a logarithm when some of them are small."""
     figure, ax = plt.subplots(figsize=(WIDTH, 0.95 + 0.33 * len(rows)), layout="constrained")
-    values = [v for r in rows for v in (r.here.value, r.textbook.value, r.bound) if v is not None and math.isfinite(v)]
+    values = [v for r in rows for v in (r.ours.value, r.reference.value, r.bound) if v is not None and math.isfinite(v)]
     scaled = min((v for v in values if v > 0), default=1.0) < 1e-2 or max(values, default=1.0) > 1e3
     if scaled:
         low, high = _range(rows)
@@ -241,7 +242,7 @@ def _listed(family: Family, rows: Sequence[HardCase]) -> Any:
         if row.bound is not None:
             at = _log(row.bound) if scaled else row.bound
             ax.plot([at, at], [i - 0.36, i + 0.36], color=OUTLINE, lw=1.6)
-        for outcome, colour, marker, shift in ((row.here, BLUE, "o", -0.2), (row.textbook, ORANGE, "x", 0.2)):
+        for outcome, colour, marker, shift in ((row.ours, BLUE, "o", -0.2), (row.reference, ORANGE, "x", 0.2)):
             place = _drawn(outcome)
             if not scaled and math.isfinite(place):
                 place = outcome.value or 0.0

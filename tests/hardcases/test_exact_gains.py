@@ -71,7 +71,7 @@ def test_a_gain_that_leaves_the_tissue_out_fails(
     """The gain for the hand is right to the last digit, the gain for the tissue is zero."""
     for method in (DenseRiccati, NewtonADI):
         monkeypatch.setattr(method, "solve", without_tissue(method.solve))
-    measured = [row for row in rows(True) if row.here.value is not None]
+    measured = [row for row in rows(True) if row.ours.value is not None]
     assert measured
     assert [row.case for row in measured if row.ok] == []
 
@@ -93,7 +93,7 @@ def test_a_gain_that_loses_digits_fails(monkeypatch: pytest.MonkeyPatch) -> None
     problem = problem_of()
     monkeypatch.setattr(NewtonADI, "solve", shaken(1e-9))
     (row,) = gain_rows("R = 1", 1.0, problem, solvers=("low rank",))
-    assert row.here.value == pytest.approx(1e-9, rel=0.01)  # the true error is a hundred times smaller
+    assert row.ours.value == pytest.approx(1e-9, rel=0.01)  # the true error is a hundred times smaller
     assert row.verdict == "fail"
 
 
@@ -107,7 +107,7 @@ def test_a_factor_beyond_the_tolerance_fails(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(NewtonADI, "solve", solve)
     (row,) = gain_rows("R = 1", 1.0, problem_of(), solvers=("low rank",))
-    assert row.here.value == math.inf
+    assert row.ours.value == math.inf
 
 
 def test_first_order_moves_the_gain_as_the_equation_does() -> None:

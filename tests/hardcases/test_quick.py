@@ -27,9 +27,9 @@ def quick(name: str) -> FamilyResult:
 def test_every_case_keeps_its_bound_or_is_refused(name: str) -> None:
     cases = quick(name).cases
     assert cases
-    assert [(case.case, case.verdict_text, case.here.value, case.bound) for case in cases if not case.ok] == []
+    assert [(case.case, case.verdict_text, case.ours.value, case.bound) for case in cases if not case.ok] == []
     # beside each stands what the textbook way gives, a number or a sentence
-    assert all(case.textbook.text or case.textbook.value is not None for case in cases)
+    assert all(case.reference.text or case.reference.value is not None for case in cases)
 
 
 # Families in which the way of a competent engineer does as well as ours; what fails stands in the remark, if anything.
@@ -41,9 +41,9 @@ EQUAL = {
 
 def fails(case: HardCase) -> bool:
     """The textbook way has no number, breaks the bound that is kept here, or goes on where it must not."""
-    value, kept = case.textbook.value, case.bound
+    value, kept = case.reference.value, case.bound
     if kept is None:
-        return not case.textbook.error
+        return not case.reference.error
     return value is None or not value <= kept
 
 
@@ -51,7 +51,7 @@ def fails(case: HardCase) -> bool:
 def test_the_textbook_way_does_as_well_and_the_remark_says_what_does_not(name: str) -> None:
     cases = quick(name).cases
     assert [case.case for case in cases if fails(case)] == []
-    assert any(EQUAL[name] in case.textbook.text for case in cases)
+    assert any(EQUAL[name] in case.reference.text for case in cases)
 
 
 @pytest.mark.parametrize("name", [name for name in FAMILIES if name not in EQUAL])

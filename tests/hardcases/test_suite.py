@@ -186,8 +186,8 @@ def test_a_loaded_machine_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None
         monkeypatch.delenv(variable, raising=False)
     (row,) = faults.rank_rows(True)
     assert row.ok
-    assert row.here.value == pytest.approx(0.9)
-    assert row.textbook.value == math.inf
+    assert row.ours.value == pytest.approx(0.9)
+    assert row.reference.value == math.inf
     assert limits[1:] == [200.0 * faults.PATIENCE, 200.0 * faults.BARE_PATIENCE]
 
 

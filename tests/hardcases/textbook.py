@@ -80,14 +80,14 @@ def newmark(M: Any, K: Any, D: Any, z: Array, dt: float, steps: int) -> Outcome:
     return Outcome(abs(energy + lost - start) / start)
 
 
-def in_short(outcome: Outcome) -> str:
+def summary_of(outcome: Outcome) -> str:
     """A number in one digit, or that there is none."""
     return "blows up" if outcome.value == math.inf else f"{outcome.value:.0e}"
 
 
 def implicit_and_explicit(M: Any, K: Any, D: Any, z: Array, dt: float, steps: int) -> Outcome:
     """Newmark's rule, and in words what leapfrog does."""
-    return Outcome(newmark(M, K, D, z, dt, steps).value, f"leapfrog {in_short(leapfrog(M, K, D, z, dt, steps))}")
+    return Outcome(newmark(M, K, D, z, dt, steps).value, f"leapfrog {summary_of(leapfrog(M, K, D, z, dt, steps))}")
 
 
 def textbook_midpoint(M: Any, K: Any, z: Array, dt: float, steps: int) -> float:
@@ -140,7 +140,7 @@ def staggered_hand(
     return Outcome(float(np.abs(momentum - impulse).max() / np.abs(impulse).max()))
 
 
-def in_turn(*arguments: Any) -> Outcome:
+def staggered(*arguments: Any) -> Outcome:
     """Hand and tissue in turn until they agree, and in words what one turn a step does."""
     agreed, once = staggered_hand(*arguments), staggered_hand(*arguments, repeat=1)
-    return Outcome(agreed.value, f"once: {in_short(once)}" if math.isfinite(agreed.value or 0.0) else agreed.text)
+    return Outcome(agreed.value, f"once: {summary_of(once)}" if math.isfinite(agreed.value or 0.0) else agreed.text)

@@ -14,7 +14,7 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene
-from softgrasp.lqr.dense.care import StateSpace
+from softgrasp.lqr.dense.care import WeightedSystem
 from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.block import Block
@@ -88,7 +88,7 @@ def hand_start(problem: RiccatiProblem, displacement: Sequence[float] | Array) -
     return Block(hand, np.zeros((2 * problem.layout.n_local, 1)))
 
 
-def closed_loop(m: StateSpace, P_N: Array) -> Array:
+def closed_loop(m: WeightedSystem, P_N: Array) -> Array:
     """Eigenvalues of the reduced closed loop."""
     K = -np.linalg.solve(m.R, m.B.T @ P_N @ m.E)
     return np.asarray(scipy.linalg.eigvals(np.linalg.solve(m.E, m.A + m.B @ K)))

@@ -11,7 +11,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.system import BlockSystem, Damping
-from softgrasp.lqr.dense.care import StateSpace
+from softgrasp.lqr.dense.care import WeightedSystem
 from softgrasp.lqr.dense.modal import relative_space
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
@@ -61,7 +61,7 @@ def plant(kind: str, rng: np.random.Generator, light: bool) -> RiccatiProblem:
     return RiccatiProblem(system, np.eye(N_S), np.zeros_like(G), np.eye(N_S), np.eye(N_S))
 
 
-def gains(problem: RiccatiProblem, space: StateSpace, rng: np.random.Generator) -> list[Array]:
+def gains(problem: RiccatiProblem, space: WeightedSystem, rng: np.random.Generator) -> list[Array]:
     """On everything; on the hand alone; on the velocity of one mode, which the bound all but reaches."""
     G, M_s = space.E[-N:, N_S : 2 * N_S], problem.M_s
     M = space.E[-N:, -N:] - problem.system.two_way * G @ np.linalg.solve(M_s, G.T)

@@ -77,6 +77,9 @@ def test_a_repeated_factor_costs_what_it_costs_on_one_rank() -> None:
     assert both[0].memory("mumps") == 2 * alone.memory("mumps")
     assert both[1].seconds("mumps") < 0.7 * alone.seconds("mumps")
     assert both[1].memory("mumps") == alone.memory("mumps")
+    assert "time.reproducible = false" in both[0].price_of_bits("mumps")
+    assert not both[1].price_of_bits("mumps")
+    assert not alone.price_of_bits("mumps")
 
 
 def test_graded_lines_go_to_a_factor() -> None:

@@ -14,12 +14,21 @@ import pytest
 from rich.console import Console
 
 from softgrasp.fem.errors import SceneError, SoftgraspError
-from softgrasp.fem.model.build import build
+from softgrasp.fem.model.build import Stopwatch, build
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.design.constrained import plan_sizes
+from softgrasp.lqr.design.feedback import design
+from softgrasp.study.control.obstacle.measure import planned_study
 from softgrasp.study.control.run import run_control
 
-SMALL = ["tissue.cells=[4,8]", "control.N=[8]", "output.fields='none'", "time.steps=60", "time.end=60.0"]
+SMALL = [
+    "tissue.cells=[4,8]",
+    "control.N=[8]",
+    "output.fields='none'",
+    "output.frames=2",
+    "time.steps=60",
+    "time.end=60.0",
+]
 
 
 def control(out: Path, *overrides: str, pictures: bool = False) -> tuple[dict, str]:
@@ -50,14 +59,15 @@ def test_page_files_and_numbers_agree(tmp_path: Path) -> None:
     assert "knows no obstacle" in page
 
 
-def test_explain_names_the_program_that_control_solves(tmp_path: Path) -> None:
+def test_explain_names_the_program_that_control_solves() -> None:
     overrides = [*SMALL, "control.constraints.horizon=34", "control.constraints.margin=1e-3"]
-    result, _ = control(tmp_path, *overrides)
-    sizes = plan_sizes(build(load_scene("paper_obstacle", overrides)))
+    model = build(load_scene("paper_obstacle", overrides))
+    found = planned_study(design(model), Stopwatch(model.system.layout.comm), lambda *_: None).result()
+    sizes = plan_sizes(model)
     assert sizes is not None
     for key in ("N", "grid", "intervals", "variables", "rows"):
-        assert getattr(sizes, key) == result["obstacle"][key]
-    assert result["obstacle"]["margin"]["reduced_plant"] == 1e-3
+        assert getattr(sizes, key) == found[key]
+    assert found["margin"]["reduced_plant"] == 1e-3
 
 
 @pytest.mark.parametrize(

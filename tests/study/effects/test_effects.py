@@ -26,20 +26,20 @@ from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.study.effects import measure as effects_measure
-from softgrasp.study.effects.experiments import Displacements, Experiments, Names, compare, displacements
+from softgrasp.study.effects.experiments import Displacements, Names, SwitchRuns, compare, displacements
 from softgrasp.study.effects.measure import (
     MeasuredScene,
     bare_output,
+    check_zero_cost,
     counting,
     difference,
-    holdings,
+    memory_by_object,
     objects_of,
     operator_hashes,
-    prove_off,
     read_table,
 )
 from softgrasp.study.effects.page import parts
-from softgrasp.study.effects.result import Change, Company, EffectResult, EffectsStudy
+from softgrasp.study.effects.result import Change, EffectResult, EffectsStudy, JointChange
 from softgrasp.study.effects.run import check_variants, run_effects, study_effects
 from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, neutral, switches
 from softgrasp.study.effects.together import advised, advised_together, finite_strain_beside
@@ -75,9 +75,8 @@ def found(comm: MPI.Intracomm, *changes: dict[str, Any], **tables: Any) -> tuple
 
 def measured(model: Any) -> MeasuredScene:
     stepper = RepeatableRun(model)
-    case = MeasuredScene(
-        model, {"step": [1.0]}, operator_hashes(model, stepper.run), holdings(model, stepper.run), stepper.flops()
-    )
+    held = memory_by_object(model, stepper.run)
+    case = MeasuredScene(model, {"step": [1.0]}, operator_hashes(model, stepper.run), held, stepper.flops())
     stepper.destroy()
     case.objects, case.objects_in_steps = objects_of(model.system.layout.comm, model.scene)
     return case
@@ -179,7 +178,7 @@ def test_damping_for_control_is_not_called_wasted(comm: MPI.Intracomm) -> None:
 # --- several switches at once
 
 
-class Trial(Experiments):
+class Trial(SwitchRuns):
     """Runs in which finite strain shows beside gravity by ``size``, or fails."""
 
     def __init__(self, size: float | None) -> None:
@@ -231,8 +230,8 @@ def test_rotation_shows_only_beside_the_reaction_that_is_advised(comm: MPI.Intra
             assert f.company.change.outputs <= 0.03
 
 
-class Table(Experiments):
-    """Experiments whose outputs are a formula of the effects that are on."""
+class Table(SwitchRuns):
+    """Runs whose outputs are a formula of the effects that are on."""
 
     def __init__(self, on: set[str], output: Callable[[Names], float], forced: Callable[[Names], float] | None) -> None:
         self.on, self.scales = frozenset(on), SCALES
@@ -265,7 +264,7 @@ def test_pairs_that_hide_below_the_tolerance_one_by_one() -> None:
     assert not advised_together(Table(set(), lambda on: y(on) - 1 + 1e3, None), tried, frozenset(), 1e-3)[0]
 
 
-def named(runs: Experiments, name: str, company: Company) -> float:
+def named(runs: SwitchRuns, name: str, company: JointChange) -> float:
     """The change by what the advice names, from the runs of exactly these scenes."""
     partners = frozenset(company.partners)
     pair = partners | {name}
@@ -323,7 +322,7 @@ def test_advice_on_a_shipped_scene_can_be_followed(comm: MPI.Intracomm) -> None:
     scene = load_scene_collective(comm, "paper_forward", small)
     study = study_effects(scene, comm)
     model = build(scene, comm=comm)
-    runs = Experiments(scene, Scales(2, *rigid_inertia(model), None), {frozenset(): model})
+    runs = SwitchRuns(scene, Scales(2, *rigid_inertia(model), None), {frozenset(): model})
     assert {"gravity", "reaction", "finite_strain"} <= set(study.advised)
     assert runs.refusal(frozenset(study.advised) - {"damping"}) == ""  # its trial value needs a frequency
     by = {f.name: f for f in study.findings}
@@ -339,7 +338,7 @@ def test_advice_on_a_shipped_scene_can_be_followed(comm: MPI.Intracomm) -> None:
 def test_a_prescribed_motion_feels_neither_reaction_nor_the_freedom_to_turn(comm: MPI.Intracomm) -> None:
     """So runs that differ in them alone are made once, with all other effects on."""
     model = build(make_scene(QUICK, hand={"inertia": 3.0}), comm=comm)
-    runs = Experiments(model.scene, SCALES, {frozenset(): model})
+    runs = SwitchRuns(model.scene, SCALES, {frozenset(): model})
     for base in (frozenset[str](), frozenset({"gravity", "damping"})):
         plain = simulate(runs.model(base))
         for more in ({"reaction"}, {"rotation"}, {"reaction", "rotation"}):
@@ -503,10 +502,10 @@ def test_proof_sees_every_effect_that_is_on(comm: MPI.Intracomm) -> None:
         if name == "layers":
             tables = {"tissue": {"layers": {"core": LAYERS["core"]}}}
         on = measured(build(make_scene(FORCE, tables), comm=comm))
-        proof = prove_off(name, bare, on)
+        proof = check_zero_cost(name, bare, on)
         assert not proof.holds, name
         assert not proof.same_operators, name
-    assert prove_off("reaction", bare, bare).holds
+    assert check_zero_cost("reaction", bare, bare).holds
 
 
 # --- scenes switched the other way
@@ -599,7 +598,7 @@ def test_effects_are_measured_on_the_mesh_that_a_tolerance_led_to(comm: MPI.Intr
     scene = load_scene_collective(comm, "paper_forward", few)
     study, model = study_effects(scene, comm), adapt.build(scene, comm=comm)
     assert study.sizes["n_e"] == model.system.layout.n_e != build(scene, comm=comm).system.layout.n_e
-    weighing = Experiments(scene, Scales(2, *rigid_inertia(model), None), {frozenset(): model}).variant({"gravity"})
+    weighing = SwitchRuns(scene, Scales(2, *rigid_inertia(model), None), {frozenset(): model}).variant({"gravity"})
     heavy = build(weighing, comm=comm, mesh=model.space.mesh)
     change = compare(displacements(model, simulate(model)), displacements(heavy, simulate(heavy)))
     (gravity,) = (f for f in study.findings if f.name == "gravity")
