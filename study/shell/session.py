@@ -39,7 +39,6 @@ class Page:
     tables: Mapping[str, Table] = field(default_factory=dict)  # by the name of its CSV file
     files: Sequence[Path] = ()  # written already: pictures and fields
     options: str = ""  # of the command line, for the page's last line: " --tolerance 1e-2"
-    reproduce: str = ""  # the whole command line, where it is no softgrasp COMMAND SCENE
     errors: Sequence[str] = ()  # sentences on the error of the result
     warnings: Sequence[str] = ()  # sentences that a reader must not miss
 
@@ -169,7 +168,7 @@ class Session:
         report = write_report(
             self.out / "report.html", title=content.title, subtitle=scene.description if scene else "", result=result,
             sections=content.sections, summary=content.summary, errors=content.errors, files=files, scene=scene,
-            warnings=list(dict.fromkeys([*self.notes, *content.warnings])), reproduce=content.reproduce or line,
+            warnings=list(dict.fromkeys([*self.notes, *content.warnings])), reproduce=line,
         )  # fmt: skip
         files.append(report)
         if clock:

@@ -59,7 +59,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def ask(file: Path, *settings: str, **keys: object) -> tuple[int, str]:
     text = io.StringIO()
     status = run_query(file, Console(file=text, width=200), settings=settings, **keys)  # type: ignore[arg-type]
-    return status, text.getvalue()
+    return status, MPI.COMM_WORLD.bcast(text.getvalue())  # rank 0 speaks for all
 
 
 def columns(path: Path) -> dict[str, list[str]]:
