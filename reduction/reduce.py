@@ -60,13 +60,15 @@ def reduce(
         model: scene. A linear reduced model is affine in its materials, see
             :meth:`softgrasp.reduction.model.ReducedModel.at`; one at finite strain answers inside the box of materials
             and motions of its runs, see :meth:`softgrasp.reduction.strain.model.StrainModel.at`.
-        runs: of it, with the snapshots in memory.
+        runs: full run of the scene, or several, with the snapshots in memory.
         method: "global_pod", "componentwise_pod", "pod_fixed", "componentwise_pod_fixed", "psd", "psd_fixed",
             "psd_cotangent_lift", "psd_svd_like" and their "_fixed" and "_relative" forms, or "craig_bampton"; all keys
             in :data:`softgrasp.reduction.bases.registry.METHODS`. None is the paper's PSD with fixed solid modes
             "psd_fixed" [SBRH21]; at finite strain there is one basis only, the cotangent lift.
-        N: dimension, the hand's 2 n_s included; linear: or a rule; None keeps 99.9 % of the energy, as the paper does.
-        inner, engine: see :func:`softgrasp.reduction.bases.registry.make_basis`; linear only.
+        N: dimension, the hand's 2 n_s included. Linear models also take a rule, and None, which keeps 99.9 % of the
+            energy as the paper does.
+        inner: inner product of the snapshots, see :func:`softgrasp.reduction.bases.registry.make_basis`; linear only.
+        engine: factorisation of the snapshots, see the same function; linear only.
 
     Returns:
         The small matrices, or the sampled cells with their weights, and the outputs of the scene; ``at`` gives the

@@ -29,11 +29,15 @@ def second_order(
     NewtonADI takes the lowest modes: where others matter more, RADI is the faster one. Collective.
 
     Args:
-        matrices: M, D, K, AIJ.
-        B: forces of the inputs, local rows (n_local, m).
+        matrices: mass M, damping D and stiffness K, AIJ matrices (n_e, n_e).
+        B: forces of unit inputs, local rows (n_local, m).
         C: outputs of the displacement, transposed, local rows (n_local, p).
-        Q, R: (p, p), symmetric positive semidefinite, and (m, m), symmetric positive definite; None stands for I.
-        damping: what D is when it is known to be alpha M + beta K, which modes do not couple by; D is ignored then.
+        Q: weight of the outputs, (p, p), symmetric positive semidefinite; None stands for I.
+        R: weight of the inputs, (m, m), symmetric positive definite; None stands for I.
+        damping: coefficients of D = alpha M + beta K, which leaves modes uncoupled; the matrix D is ignored then.
+
+    Returns:
+        The problem, which owns copies of M, D and K and has no degrees of freedom of a hand.
 
     Raises SolverError: the shapes do not fit, or a matrix is not symmetric.
     """

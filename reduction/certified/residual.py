@@ -54,20 +54,20 @@ class ResidualNorms:
         return int(self.static.shape[1] // layers - self.n_s) // 3
 
     def leading(self, k: int) -> ResidualNorms:
-        """Of the first k modes: leading blocks."""
+        """Norms of the residual of the model of the first k modes: the leading blocks of both triangles."""
         width = len(self.reference) * (self.n_s + 3 * k)
         return replace(self, static=_leading(self.static, width), mass=_leading(self.mass, width))
 
     @cached_property
     def galerkin(self) -> ResidualNorms:
-        """The same for residuals with Phi' r = 0: these have no part in the rows of K_r Phi, nor of M_r Phi."""
+        """Norms for residuals with Phi' r = 0, which have no part in the rows of K_r Phi, nor of M_r Phi."""
         static = orthogonal_complement(self.static, self.columns("static", self.reference)[2])
         mass = orthogonal_complement(self.mass, self.columns("mass", self.reference)[1])
         return replace(self, static=static, mass=mass)
 
     @cached_property
     def _parts(self) -> dict[str, tuple[Array, Array]]:
-        """Of the triangles: columns of G_1, (layers, rows n_s), and of M_1, K_mu and K_lambda, (3 layers, rows k)."""
+        """Columns of each triangle for G_1, (layers, rows n_s), and for M_1, K_mu and K_lambda, (3 layers, rows k)."""
         layers, width = len(self.reference), len(self.reference) * self.n_s
         triangles = {"static": self.static, "mass": self.mass, "both": np.vstack([self.static, self.mass])}
         return {
@@ -81,7 +81,10 @@ class ResidualNorms:
     def columns(
         self, which: Literal["static", "mass", "both"], materials: tuple[LayerMaterial, ...], count: int = 4
     ) -> tuple[Array, ...]:
-        """Blocks of a triangle at a parameter: of c, (rows, n_s), and of b' + alpha b, a, viscous b, (rows, k)."""
+        """Blocks of a triangle at a parameter, the first ``count`` of these four.
+
+        They multiply the hand's load c, (rows, n_s), then b' + alpha b, a and viscous b of the modes, (rows, k) each.
+        """
         hand, tissue = self._parts[which]
         rows = hand.shape[1] // self.n_s
         weights = np.array(  # of M_1, K_mu, K_lambda in every layer
@@ -103,6 +106,7 @@ class ResidualNorms:
         return float(max(max(pair) for pair in self._ratios(materials)) ** 0.5)
 
     def _ratios(self, materials: tuple[LayerMaterial, ...]) -> list[tuple[float, float]]:
+        """Ratios of mu and of mu + d lambda / 2 of each layer to those of the reference [1]."""
         half = self.dimension / 2
         pairs = zip(materials, self.reference, strict=True)
         return [(m.mu / r.mu, (m.mu + half * m.lam) / (r.mu + half * r.lam)) for m, r in pairs]
@@ -140,9 +144,9 @@ class Orthonormal:
     Gram-Schmidt with re-orthogonalisation, one solve a column; Y = W^-1 Q is kept beside Q.
 
     Args:
-        W: symmetric positive definite; None stands for W^-1 = ``product``.
-        layout: of the system.
-        product: the inner product itself instead of W.
+        system: system of the tissue, for the distribution of the rows and the choice of the solver.
+        W: matrix of the norm, symmetric positive definite; None stands for W^-1 = ``product``.
+        product: matrix W^-1 itself, which needs no solver; None where W is given.
     """
 
     def __init__(self, system: BlockSystem, W: PETSc.Mat | None, product: PETSc.Mat | None = None) -> None:
