@@ -346,6 +346,9 @@ def check_dimension(scene: Scene, d: int) -> None:
 def scene_schema() -> dict[str, Any]:
     """JSON schema of a scene file, draft 2020-12."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema(by_alias=True)
+    reduction = schema["$defs"]["Reduction"]
     own = {"type": "string", "description": "a basis of reduction.plugins"}
-    schema["$defs"]["Reduction"]["properties"]["methods"]["items"] = {"anyOf": [{"enum": list(BASES)}, own]}
+    reduction["properties"]["methods"]["items"] = {"anyOf": [{"enum": list(BASES)}, own]}
+    reduction["if"] = {"properties": {"plugins": {"maxItems": 0}}}
+    reduction["then"] = {"properties": {"methods": {"items": {"enum": list(BASES)}}}}
     return schema

@@ -82,6 +82,7 @@ def test_schema_and_loader_agree(
 def test_unknown_bases_are_refused(validator: jsonschema.Draft202012Validator) -> None:
     data = tomllib.loads(shipped_scenes()["paper_forward"].read_text())
     assert not validator.is_valid(data | {"reduction": {"methods": ["global_pud"]}})
+    assert validator.is_valid(data | {"reduction": {"methods": ["global_pud"], "plugins": ["mine.py"]}})
 
 
 def test_names_of_bases_are_those_that_can_be_built() -> None:
