@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from softgrasp.fem.effects.gate import Effect, Gate, Problem
 from softgrasp.fem.scene.scene import Scene
 
@@ -12,6 +10,7 @@ class ObstaclesEffect(Effect):
     """Forces 0 <= x that keep the gap g >= 0 of all boundary nodes, x'g = 0, and an inelastic impulse at touch."""
 
     name = "obstacles"
+    threshold = 0.0
     term = "N'x with 0 <= x, g >= 0, x'g = 0 on the boundary, and an inelastic impulse at touch"
     cost = "A look at the gaps in every step, one solve for a node that touches, a small problem in a step of contact."
 
@@ -20,13 +19,13 @@ class ObstaclesEffect(Effect):
         return ("columns of S^-1 N'",) if self.active(scene) else ()
 
     def gate(self, problem: Problem) -> Gate:
-        """Whether there is an obstacle to touch; only a run tells whether the tissue gets there."""
-        on = self.active(problem.scene)
+        """Number of obstacles; only a run tells whether the tissue gets there."""
+        number = len(problem.scene.obstacle or [])
         sentence = (
-            f"{len(problem.scene.obstacle or [])} obstacles; a run that never touches one repeats that without the "
-            "effect bit for bit: drop it then."
-            if on
-            else "Off; the scene has no [[obstacle]]."
+            "Off; the scene has no [[obstacle]]."
+            if number == 0
+            else "A run that touches no obstacle is that without the effect, bit for bit; it reports the least gap."
+            if self.active(problem.scene)
+            else "Off; the tissue goes through the obstacles that control plans around."
         )
-        condition = "counts where an [[obstacle]] is given; the run tells the least gap"
-        return Gate(math.nan, "least gap", math.nan, on, sentence, condition=condition)
+        return Gate(number, "number of obstacles", self.threshold, number > self.threshold, sentence)
