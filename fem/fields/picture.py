@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import dolfinx.mesh
 import numpy as np
@@ -13,6 +13,9 @@ from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.contact import contact_facets, rigid_modes
 from softgrasp.fem.petsc import Array, rows_on_root
+
+if TYPE_CHECKING:
+    from softgrasp.fem.obstacles import Obstacle
 
 Integers = npt.NDArray[np.int64]
 
@@ -29,6 +32,7 @@ class PictureMesh:
     names: tuple[str, ...]  # name of each layer
     reference: Array  # point the hand turns about [m], shape (d,)
     n_s: int  # number of degrees of freedom of the hand [1]
+    obstacles: tuple[Obstacle, ...] = ()  # what the tissue may touch and does not move
 
     @property
     def dimension(self) -> int:
@@ -66,7 +70,12 @@ def gather_picture(model: Model) -> PictureMesh | None:
     if not whole:
         return None
     points, cells, facets, contact, layers = whole
-    return PictureMesh(points, cells, facets, contact, layers, model.space.layers, layout.reference, layout.n_s)
+    fixed: tuple[Obstacle, ...] = ()
+    if model.scene.effects.obstacles:
+        from softgrasp.fem.obstacles import make_obstacles  # only such scenes pay for it
+
+        fixed = tuple(o for o in make_obstacles(model.scene, layout.dimension) if o.path is None)
+    return PictureMesh(points, cells, facets, contact, layers, model.space.layers, layout.reference, layout.n_s, fixed)
 
 
 def vertex_displacement(model: Model, z: Array, q_s: Array) -> Array | None:

@@ -164,6 +164,11 @@ def make_axes(
         if solid:
             ax.set_axis_off()
             continue
+        if shot.picture.obstacles:
+            from softgrasp.study.pictures.obstacles import draw_obstacle  # few scenes have any
+
+            for obstacle in shot.picture.obstacles:
+                draw_obstacle(ax, obstacle.shape, obstacle.name, np.array([low, high]))
         ax.xaxis.set_major_locator(MaxNLocator(int(np.clip(w / 0.5, 2, 6)), steps=style.STEPS))
         ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(h / 0.4, 2, 6)), steps=style.STEPS))
         ax.tick_params(labelbottom=i // columns == rows - 1, labelleft=i % columns == 0)

@@ -8,20 +8,17 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import LineCollection
-from matplotlib.patches import Circle, Polygon
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import cKDTree
 
 from softgrasp.fem.columns import AXES
 from softgrasp.fem.fields.picture import PictureMesh
-from softgrasp.fem.obstacles import Ball, HalfSpace, Polytope, Shape
-from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.constrained import PlannedControl
 from softgrasp.study.control.obstacle.result import PlannedStudy
 from softgrasp.study.pictures import style
+from softgrasp.study.pictures.obstacles import draw_obstacle
 
 SHOWN = (0.0, 0.12, 0.28, 0.45, 0.62, 0.8, 1.0)  # shares of the way at which the body is drawn
 MANY = 2000  # points of a line; in print more of them coincide
-OBSTACLE: dict[str, Any] = {"facecolor": "#d9d9d9", "edgecolor": style.OUTLINE, "lw": 0.8, "zorder": 0.5}
 LIMIT: dict[str, Any] = {"color": "#999999", "lw": 0.8, "ls": (0, (4, 2))}
 
 
@@ -48,7 +45,7 @@ def figure_bodies(planned: PlannedControl, picture: PictureMesh, out_png: Path) 
         width = style.WIDTH
         figure, ax = plt.subplots(figsize=(width, width * (box[1, 1] - box[0, 1]) / (box[1, 0] - box[0, 0])))
         for shape, name in zip(planned.plan.task.shapes, planned.names, strict=True):
-            _draw_obstacle(ax, shape, name, box)
+            draw_obstacle(ax, shape, name, box)
         worst = [int(runs.free.gaps[:, i].argmin()) for i in range(len(planned.names))]
         for n in sorted(set(worst)):
             ax.add_collection(
@@ -62,28 +59,6 @@ def figure_bodies(planned: PlannedControl, picture: PictureMesh, out_png: Path) 
         ax.plot(*centre[:: max(1, len(centre) // MANY)].T, color=style.HAND, lw=0.7, ls=(0, (1, 1.2)), zorder=2)
         ax.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal", xlabel="$x$ [m]", ylabel="$y$ [m]")
         return style.save(figure, out_png)
-
-
-def _draw_obstacle(ax: Any, shape: Shape, name: str, box: Array) -> None:
-    """Filled, as far as it lies in the picture."""
-    if isinstance(shape, Ball):
-        ax.add_patch(Circle(tuple(shape.center), shape.radius, **OBSTACLE))
-        place = shape.center
-    elif isinstance(shape, Polytope):
-        corners = shape.corners[ConvexHull(shape.corners).vertices]
-        ax.add_patch(Polygon(corners, **OBSTACLE))
-        place = corners.mean(axis=0)
-    else:
-        assert isinstance(shape, HalfSpace)
-        along = np.array([-shape.normal[1], shape.normal[0]])
-        size = float(np.linalg.norm(box[1] - box[0]))
-        foot = box.mean(axis=0) + (shape.offset - box.mean(axis=0) @ shape.normal) * shape.normal
-        back = foot - size * shape.normal
-        ax.add_patch(
-            Polygon([foot - size * along, foot + size * along, back + size * along, back - size * along], **OBSTACLE)
-        )
-        place = np.clip(foot - 0.02 * size * shape.normal, box[0] + 0.05 * size, box[1] - 0.02 * size)
-    ax.text(*place, name, ha="center", va="center", fontsize=7, color=style.OUTLINE, clip_on=True)
 
 
 def figure_gaps(planned: PlannedControl, out_png: Path) -> tuple[Path, ...]:
