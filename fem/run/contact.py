@@ -86,7 +86,6 @@ class Contact:
         self.small = SmallProblem()
         self.z, self.moved, self.forces = (np.zeros(self.p * self.d) for _ in range(3))
         self.gaps = self.after = np.zeros((len(self.obstacles), self.p))
-        self.rows = self._make_rows(np.zeros((0, 2), dtype=int))
         # rows of W where all obstacles are flat, their responses, and whether a pair of obstacle and node has a row
         self.pairs, self.columns, self.W = np.zeros((0, 2), dtype=int), list[int](), np.zeros((0, 0))
         self.entered = np.zeros_like(self.gaps, dtype=bool)
@@ -94,6 +93,7 @@ class Contact:
         self.drive: TableDrive | ForceDrive | None = None
         self.n = 0  # number of the step in work
         self.responses = self._make_responses()
+        self.room = system.M_ee.createVecs()
 
     def _make_responses(self) -> Responses:
         bases = [o.shape.normal[None] if isinstance(o.shape, HalfSpace) else np.eye(self.d) for o in self.obstacles]
@@ -136,7 +136,7 @@ class Contact:
     # ---- the run
 
     def start(self, state: TissueState, q: Array, n: int = 0) -> None:
-        """Look at the state at step n, with the hand at q. Collective.
+        """Look at the state at step n, with the hand at q and no node pressed. Collective.
 
         Raises SceneError: an obstacle is in the tissue at the start.
         """
@@ -144,6 +144,7 @@ class Contact:
         x = self._at(self.z, q)
         self.gaps = self._gaps(x, n)
         self.table.gap[n] = self.gaps.min(axis=1)
+        self.rows = self._make_rows(np.zeros((0, 2), dtype=int))
         if n == 0 and self.gaps.min() < -self._tolerance(x):
             o, i = np.unravel_index(self.gaps.argmin(), self.gaps.shape)
             place = ", ".join(f"{c:.4g}" for c in x[i])
@@ -307,7 +308,7 @@ class Contact:
         if np.abs(b).max() <= STILL * self.fastest:
             return
         free = self.hand is not None
-        u, momentum, y = stopping_impulse(self.system, self.surface, rows.node, normal, b, free)
+        u, momentum, y = stopping_impulse(self.system, self.surface, rows.node, normal, b, free, self.room)
         self._kick(state, n, u, momentum)
         table, impulse = self.table, y[:, None] * normal
         np.add.at(table.impulse[n - 1], rows.obstacle, impulse)
@@ -383,5 +384,5 @@ class Contact:
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
-        self.b.destroy()
-        self.y.destroy()
+        for vector in (self.b, self.y, *self.room):
+            vector.destroy()

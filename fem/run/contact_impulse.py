@@ -8,24 +8,30 @@ from scipy.sparse import csr_matrix
 
 from softgrasp.fem.model.surface import Surface
 from softgrasp.fem.obstacles.impulse import stop
-from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.system import BlockSystem
 
 
 def stopping_impulse(
-    system: BlockSystem, surface: Surface, nodes: NDArray[np.intp], normal: Array, b: Array, free: bool
+    system: BlockSystem,
+    surface: Surface,
+    nodes: NDArray[np.intp],
+    normal: Array,
+    b: Array,
+    free: bool,
+    room: tuple[PETSc.Vec, PETSc.Vec],
 ) -> tuple[Array, Array, Array]:
     """Jump u of the velocity with N u = b and least energy, M u, and the impulses y of the rows, M u = N'y. Collective.
 
     The owned rows of the tissue come first, then the hand where it is ``free`` and feels the tissue; there M has G and
-    M_hand + M_rigid as well, and N has N_s = N T.
+    M_hand + M_rigid as well, and N has N_s = N T. ``room``: two vectors of the tissue, overwritten.
     """
     comm, n, (p, d) = system.layout.comm, system.layout.n_local, surface.X.shape
     columns, k = (nodes[:, None] * d + np.arange(d)).ravel(), len(b)
     N = csr_matrix((normal.ravel(), columns, np.arange(k + 1) * d), shape=(k, p * d))
     M_s, N_s = (system.M_hand + system.M_rigid, N @ surface.T) if free else (np.zeros((0, 0)), np.zeros((k, 0)))
     G = system.G if free else np.zeros((n, 0))
-    at, of = system.M_ee.createVecs()
+    at, of = room
     system.M_ee.getDiagonal(at)
     diagonal = np.concatenate([at.array_r, np.diag(M_s)])
 
@@ -44,8 +50,4 @@ def stopping_impulse(
         return float(total(comm, np.array([a[:n] @ b[:n]]))[0] + a[n:] @ b[n:])
 
     small = (N.multiply(1 / surface.gather(diagonal)) @ N.T).toarray() + N_s / diagonal[n:] @ N_s.T
-    try:
-        return stop(multiply, diagonal, dot, lambda u: N @ surface.gather(u) + N_s @ u[n:], transpose, small, b)
-    finally:
-        at.destroy()
-        of.destroy()
+    return stop(multiply, diagonal, dot, lambda u: N @ surface.gather(u) + N_s @ u[n:], transpose, small, b)

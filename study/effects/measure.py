@@ -73,7 +73,8 @@ def operator_hashes(model: Model, run: Run) -> dict[str, str]:
         matrices["D_ee"] = system.damping.matrix
     arrays: dict[str, list[Array]] = {name: list(A.getValuesCSR()) for name, A in matrices.items()}
     arrays |= {name: [getattr(system, name)] for name in ("T", "G", "M_hand", "M_rigid")}
-    hand = (run.drive, getattr(run.drive, "step", None))
+    drive = getattr(run.drive, "drive", run.drive)  # without contact
+    hand = (drive, getattr(drive, "step", None))
     arrays["hand"] = [getattr(part, name) for part in hand for name in ("c", "inverse", "GY") if hasattr(part, name)]
     return {name: "".join(comm.allgather(digest(*parts))) for name, parts in arrays.items()}
 
@@ -97,7 +98,11 @@ def memory_by_object(model: Model, run: Run) -> dict[str, float]:
     """
     system, comm, midpoint = model.system, model.system.layout.comm, run.midpoint
     holders: list[tuple[str, Any]] = [("", system), ("", system.damping), ("step.", midpoint), ("hand.", run.drive)]
-    holders.append(("hand.", getattr(run.drive, "step", None)))
+    holders.append(("hand.", getattr(getattr(run.drive, "drive", run.drive), "step", None)))
+    contact = run.contact
+    if contact is not None:
+        holders += [("contact.", at) for at in (contact, contact.responses, contact.small, contact.table)]
+        holders.append(("contact.surface.", contact.surface))
     holders += [("step.", midpoint.operators), ("step.order.", midpoint.operators.order)]
     holders += [("points.", system.points), ("points.", getattr(midpoint, "body", None))]
     for layer in system.layers:

@@ -118,6 +118,8 @@ class RepeatableRun:
         run.state.v.stateIncrease()
         run.midpoint.start(run.state)
         run.midpoint.dissipated = 0.0
+        if run.contact is not None:
+            run.contact.start(run.state, run.drive.q[0])
         run.reached = 0
         self.ts.setStepNumber(0)
 
