@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from softgrasp.lqr.spectrum.certificate import abscissa as abscissa
     from softgrasp.reduction.archive import load as load
     from softgrasp.reduction.archive import save as save
+    from softgrasp.reduction.gradient import gradient as gradient
     from softgrasp.reduction.reduce import errors as errors
     from softgrasp.reduction.reduce import reduce as reduce
     from softgrasp.reduction.reduce import replay as replay
@@ -53,6 +54,7 @@ _FACE = {
     "reduce": "reduction.reduce",
     "replay": "reduction.reduce",
     "errors": "reduction.reduce",
+    "gradient": "reduction.gradient",
     "save": "reduction.archive",
     "load": "reduction.archive",
     "problem": "lqr.design",
