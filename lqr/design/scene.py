@@ -48,8 +48,8 @@ def problem(model: Model) -> RiccatiProblem:
     >>> problem.names
     ('tip_x', 'tip_y')
     """
-    model.scene.refuse_contact("control")
     model = checked_model(model)
+    model.scene.refuse_contact("control")
     scene, system = model.scene, model.system
     outputs = make_outputs(scene, system)
     C_z = output_columns(outputs, system.layout.n_local)

@@ -12,14 +12,13 @@ from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.pod import PartsRequest
-from softgrasp.reduction.bases.registry import METHODS, Method
+from softgrasp.reduction.bases.registry import METHODS, OWN_METHODS, Method
 from softgrasp.reduction.bases.states import BasisError, Columns, States
 from softgrasp.reduction.bases.truncation import Part
 
 Displacements = Callable[[States, int], Array]
 """Makes k or more displacements relative to the hand, local rows (n_local, k), the important ones first. Collective."""
 
-SHIPPED = frozenset(METHODS)
 DEPENDENT = 1e-7  # of a column's norm that the columns before it leave: less is rounding, as for the Cholesky factor
 
 
@@ -95,8 +94,8 @@ def load_plugins(files: Sequence[Path]) -> tuple[str, ...]:
         if not isinstance(found, list | tuple) or not found or not all(isinstance(m, Method) for m in found):
             raise BasisError(f"{file}: it must set METHODS, a list of softgrasp.reduction.bases.plugins' methods")
         for method in found:
-            if method.key in SHIPPED:
+            if method.key in METHODS:
                 raise BasisError(f"{file}: '{method.key}' is the name of a shipped basis; take another")
-            METHODS[method.key] = method
+            OWN_METHODS[method.key] = method
             keys.append(method.key)
     return tuple(keys)

@@ -94,7 +94,10 @@ def _methods() -> dict[str, Method]:
 
 
 METHODS: dict[str, Method] = _methods()
-"""Every basis by key."""
+"""Every shipped basis by key."""
+
+OWN_METHODS: dict[str, Method] = {}
+"""Bases of a user by key, see :mod:`softgrasp.reduction.bases.plugins`."""
 
 PAPER_METHODS = ("global_pod", "componentwise_pod", "pod_fixed", "componentwise_pod_fixed", "psd", "psd_fixed")
 """The six of the paper, in its order."""
@@ -105,9 +108,10 @@ PAPER_PLAIN = ("global_pod", "componentwise_pod")
 
 def find_method(name: str) -> Method:
     """Look a basis up. Raises BasisError: there is none of this name."""
-    if name not in METHODS:
-        raise BasisError(f"basis '{name}' is unknown; choose one of {', '.join(METHODS)}")
-    return METHODS[name]
+    known = METHODS | OWN_METHODS
+    if name not in known:
+        raise BasisError(f"basis '{name}' is unknown; choose one of {', '.join(known)}")
+    return known[name]
 
 
 def make_basis(

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import Formatter, LogLocator, MaxNLocator
 
 from softgrasp.lqr.reduced.bases import BASES
-from softgrasp.reduction.bases.registry import METHODS
+from softgrasp.reduction.bases.registry import METHODS, OWN_METHODS
 from softgrasp.study.control.plots import LOOKS as BASIS_LOOKS
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.pictures.style import BLUE, FULL, GREEN, HAND, ORANGE, PURPLE, UNSTABLE, WIDTH, paper_style, save
@@ -184,7 +184,8 @@ def figure_reduced(points: Sequence[ReducedPoint], full: float, paper: bool, out
             front = _front(ax, points, x, "error_outputs_full")
             _axes_log(ax, label, DEFORMATION if ax is axes[0] else "")
             ax.axvline(full, **FULL)
-        titles = {name: METHODS[name].short_title if name in METHODS else name for name in names}
+        known = METHODS | OWN_METHODS
+        titles = {name: known[name].short_title if name in known else name for name in names}
         handles = [_handle(titles[n], **look[n]) for n in names] + front + [_handle("full run", **FULL)]
         handles += _mark(axes[:1], paper, PAPER_REDUCED, f"paper, N = 14: {PAPER_REDUCED} s", ls=":")
         handles += _mark(axes[1:], paper, PAPER_FULL, f"paper, full: {PAPER_FULL} s")

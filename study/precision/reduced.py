@@ -16,7 +16,7 @@ from softgrasp.fem.model.build import Stopwatch
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.bases.engines import ENGINES, EngineName, Factor, factor, small_svd
-from softgrasp.reduction.bases.registry import METHODS
+from softgrasp.reduction.bases.registry import find_method
 from softgrasp.reduction.bases.states import states_of
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import Stepper, prepared, run
@@ -78,7 +78,7 @@ class ReducedRuns:
             bases, _ = bases_of(name, states_of(against.model.system, against.snapshots), section.N, section, {})
             return [_timed_model(model, point, against, probe) for model, point in measured(bases, against, {})]
 
-        label = f"{METHODS[name].title}, {self.setting.label}"
+        label = f"{find_method(name).title}, {self.setting.label}"
         models = self.runs.cache.point(label, "reduced", key, TimedModel, sweep)
         return [self._point(name, model) for model in models]
 
@@ -89,8 +89,8 @@ class ReducedRuns:
         lost = (float("inf"), float("inf"))
         error, displacement = errors_of(series, self.truth.series) if finite else lost
         scratch = model.time_offline + model.time_setup + model.time_online
-        scratch += full.seconds if METHODS[name].snapshots else full.mesh + full.assembly
-        label, setting = f"{METHODS[name].title}, N = {model.N}, {self.setting.label}", self.setting
+        scratch += full.seconds if find_method(name).snapshots else full.mesh + full.assembly
+        label, setting = f"{find_method(name).title}, N = {model.N}, {self.setting.label}", self.setting
         own = ("error", "error_deformation", "times", "values")
         return ReducedPoint(
             name, label, model.time_online, error, model.stable and finite, method=name, mesh=setting.mesh,

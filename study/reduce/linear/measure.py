@@ -74,7 +74,7 @@ def bases_of(
 
     What does not fit is put into ``refused`` by its N, with the reason. Collective.
     """
-    method, n_s = registry.METHODS[name], states.system.layout.n_s
+    method, n_s = registry.find_method(name), states.system.layout.n_s
     inner = None if options.inner == "auto" or not method.snapshots else options.inner
     rule = [Truncation(energy=options.energy)] if method.snapshots else []
     refused |= registry.impossible_sizes(method, n_s, sizes)
@@ -157,7 +157,7 @@ def sweep(name: str, full: FullRun, options: Reduction, progress: Progress = lam
         models = {N: models[N] for N in models if N in kept_points(points)}
     sigma, inner = (bases[0].sigma, bases[0].inner) if bases else ((), "")
     about = dict(sorted(refused.items())), kept, inner
-    return MethodSweep(registry.METHODS[name], tuple(points), models, sigma, *about)
+    return MethodSweep(registry.find_method(name), tuple(points), models, sigma, *about)
 
 
 def sweep_all(names: Sequence[str], full: FullRun, say: Say) -> tuple[MethodSweep, ...]:

@@ -539,11 +539,13 @@ def test_switched_off_leaves_a_valid_scene(comm: MPI.Intracomm) -> None:
         motion={"target": [5.0, 3.0, 0.2]},
         control={"R": R},
     )
-    by = {s.name: s for s in switches(scene, SCALES) if s.name != "finite_strain"}  # not beside rotation
+    by = {
+        s.name: s for s in switches(scene, SCALES) if s.name not in ("finite_strain", "obstacles")
+    }  # not beside rotation
     assert all(s.on for s in by.values())
     for name, s in by.items():
         assert not EFFECTS[name].active(s.other)
-        others = [e for key, e in EFFECTS.items() if key not in (name, "finite_strain")]
+        others = [e for key, e in EFFECTS.items() if key not in (name, "finite_strain", "obstacles")]
         assert all(e.active(s.other) for e in others)
         assert neutral(s.other, name, 2) is None or EFFECTS[name].active(neutral(s.other, name, 2))
     assert by["rotation"].other.control.R == [[1.0, 0.0], [0.0, 2.0]]
