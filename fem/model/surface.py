@@ -41,7 +41,7 @@ def node_distance(space: Discretisation) -> float:
     mesh.topology.create_connectivity(space.mesh.dimension - 1, space.mesh.dimension)
     facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
     longest = mesh.comm.allreduce(mesh.h(space.mesh.dimension - 1, facets).max(initial=0.0), MPI.MAX)
-    return float(longest) / space.V.element.basix_element.degree
+    return float(longest / space.V.element.basix_element.degree)
 
 
 def make_surface(space: Discretisation, system: BlockSystem) -> Surface:
