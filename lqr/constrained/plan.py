@@ -40,9 +40,10 @@ class Task:
     u_bar: Array  # steady input at the target [N], (n_s,)
     shapes: tuple[Shape, ...]  # obstacles
     names: tuple[str, ...]  # of the obstacles
-    error: Array  # bound on what the reduced plant leaves out at every node [m], (nodes, 2)
+    error: Array  # margin for what the reduced plant leaves out at every node [m], (nodes, 2)
     clearance: float = 0.0  # distance to keep beyond that [m]
     limits: Limits = field(default_factory=Limits)  # of the hand
+    bounded: bool = True  # whether ``error`` is a proved bound
     penalty: float | None = None  # cost of a metre inside an obstacle [1/m]; None: :data:`PRICE` times that of the way
 
 
@@ -79,6 +80,8 @@ class Plan:
             return f"the body is inside clearance and margin for {self.outside:.4g} s, {self.depth:.3g} m at most"
         if not self.gap >= 0:
             return f"between two instants the body may come {-self.gap:.2g} m nearer than the clearance"
+        if not self.task.bounded:
+            return "control.constraints.margin is a number, no bound on what the reduced plant leaves out"
         if self.unsafe:
             return f"behind the horizon of {self.horizon.steps} intervals the body or the hand may break its limits"
         return ""
@@ -132,12 +135,29 @@ def make_plan(plant: HeldPlant, task: Task, steps: int, longest: int | None = No
     level = tail_level(plant, _at_target(task), task.limits, task.u_bar)
     if not level > 0:
         raise ControlError("the target holds the hand beyond its own limit of force; raise control.constraints.force")
-    longest = LONGEST * steps if longest is None else longest
+    if longest is None:
+        longest = LONGEST * steps
+        _check_in_time(plant, task, longest * plant.grid)
     while True:
         plan = _cheapest(Horizon(plant, steps), task, level)
         if not plan.unsafe or steps >= longest:
             return plan
         steps = min(longest, steps + plan.unsafe)
+
+
+def _check_in_time(plant: HeldPlant, task: Task, longest: float) -> None:
+    """Raises ControlError where the hand cannot come to rest at its target in ``longest`` seconds."""
+    n_s, speed = plant.n_s, np.inf if task.limits.speed is None else task.limits.speed
+    least, way = 0.0, np.abs(task.start[:n_s])
+    if task.limits.force is not None:
+        fastest = np.abs(plant.B[n_s : 2 * n_s]) @ (task.limits.force + np.abs(task.u_bar))
+        least = float((2 * np.sqrt(way / fastest)).max())
+    least = max(least, float((way / speed).max()))
+    if least > longest:
+        raise ControlError(
+            f"within its limits the hand needs at least {least:.4g} s to the target, and a plan lasts {longest:.4g} s "
+            "at most; raise control.constraints.speed or force, or set control.constraints.horizon in seconds"
+        )
 
 
 def _at_target(task: Task) -> list[tuple[Array, Array]]:
@@ -294,7 +314,10 @@ def _judged(
         bend = max(bend, float(own[:H][holds].max(initial=0.0)))
     unsafe |= broken(plant, x, u, task.limits, task.u_bar)
     last = np.flatnonzero(unsafe[H:])
+    more = 0 if len(last) == 0 else int(last[-1]) + 1
+    if task.limits.jump is not None and (np.abs(plant.K @ x[-1, -1] - u[-1]) > task.limits.jump).any():
+        more = len(u) - H + 1  # the first interval of the tail
     return Plan(
         horizon, task, c, normals, slack, bend, float(multipliers.max(initial=0.0)), (),
-        (), 0, (), (), 0, gap, len(u) - H, 0 if len(last) == 0 else int(last[-1]) + 1,
+        (), 0, (), (), 0, gap, len(u) - H, more,
     )  # fmt: skip

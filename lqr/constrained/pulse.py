@@ -21,8 +21,7 @@ from softgrasp.lqr.plant.checks import ControlError
 
 FORGOTTEN = 1e-13  # of an amplitude: what older pulses leave is bounded by a geometric sum
 MOST_PULSES = 100_000  # memory of a tissue that hardly decays
-FINE = 128  # instants of an interval where the error is bounded; between them by its acceleration
-COARSE = 64  # instants where the acceleration is sampled, which is a few percent of the bound
+FINE = 256  # instants of an interval where error and acceleration are bounded; what is between them is a few percent
 
 
 @dataclass(frozen=True)
@@ -108,6 +107,13 @@ class PulseError:
         size = np.abs(shape) @ (left[:, None] * np.abs(coupling))
         return np.asarray(size.reshape(*self.full.seen.shape[:2], -1))
 
+    def modewise(self, derivative: int) -> Array:
+        """Bound on sum_k |w_k| at every instant, each mode by its size: coarse, but proved; (nodes, d, n_s)."""
+        p, scale, shape, coupling = self._parts
+        passed = np.abs(np.exp(p * self.grid) - 1) / (1 - np.exp(p.real * self.grid))  # of all pulses but the newest
+        size = np.abs(shape) @ ((np.abs(scale * p**derivative) * (1 + passed))[:, None] * np.abs(coupling))
+        return np.asarray(size.reshape(*self.full.seen.shape[:2], -1))
+
     def level(self, s: float, derivative: int = 0) -> Array:
         """sum_k |w_k(s)| of a unit of each acceleration, (nodes, d, n_s)."""
         return np.asarray(np.abs(self.kernel(s, derivative)).sum(axis=-1) + self.forgotten(derivative))
@@ -115,12 +121,13 @@ class PulseError:
     def bound(self, largest: Array) -> Array:
         """Bound on |e_j| at every time, (nodes, d) [m].
 
-        At :data:`FINE` instants of an interval exactly; between two of them the error leaves its chord by an eighth of
-        the square of their distance times its acceleration, whose l1 norm is taken at :data:`COARSE` of them.
+        At :data:`FINE` instants of an interval exactly. Between two of them a function leaves its chord by an eighth of
+        the square of their distance times its second derivative: the error by its acceleration, and the acceleration
+        by its own second derivative, which is bounded mode by mode.
 
         ``largest``: bound on |a_i| [m/s2], (n_s,).
         """
-        instants, coarse = (self.grid * np.linspace(0, 1, count + 1) for count in (FINE, COARSE))
+        instants, leaves = self.grid * np.linspace(0, 1, FINE + 1), (self.grid / FINE) ** 2 / 8
         at = np.max([self.level(s) @ largest for s in instants[1:]], axis=0)
-        bend = np.max([self.level(s, 2) @ largest for s in coarse], axis=0)
-        return np.asarray(at + (self.grid / FINE) ** 2 / 8 * bend)
+        bend = np.max([self.level(s, 2) @ largest for s in instants], axis=0)
+        return np.asarray(at + leaves * (bend + leaves * (self.modewise(4) @ largest)))

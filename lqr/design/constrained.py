@@ -84,7 +84,8 @@ def plan_control(design: Design, watch: Stopwatch, notify: Callable[[int, int], 
         shapes, names = tuple(o.shape for o in obstacles), tuple(o.name for o in obstacles)
         penalty = None if given.penalty == "auto" else float(given.penalty)
         target = _places(plant, surface, design)
-        task = Task(begin, target, design.target.u, shapes, names, error, given.clearance, limits, penalty)
+        bounded = given.margin == "bound"
+        task = Task(begin, target, design.target.u, shapes, names, error, given.clearance, limits, bounded, penalty)
         steps = first_horizon(design.model, plant)
         longest = None if given.horizon == "auto" else steps
         plan = on_root(plant.layout.comm, lambda: make_plan(on_grid, task, steps, longest))

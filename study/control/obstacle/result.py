@@ -54,7 +54,7 @@ class PlannedStudy:
             "error_of_run_step": runs.step_error,
             "certified": plan.certified,
             "reason": plan.reason,
-            "gap_certified": plan.gap if np.isfinite(plan.gap) else None,
+            "gap_certified": plan.gap if task.bounded and np.isfinite(plan.gap) else None,
             "depth": plan.depth,
             "time_outside": plan.outside,
             "cost": runs.planned.cost,

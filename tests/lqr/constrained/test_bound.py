@@ -69,6 +69,10 @@ def test_bound_holds_and_is_attained() -> None:
     reached = errors(full, pulses.reduced, worst, parts)[-1, 3, j, d]
     assert abs(reached / level[j, d] - 1) < 1e-6
     assert level[j, d] <= bound[j, d]
+    between = [pulses.level(s, 4) for s in GRID * rng.uniform(0, 1, 20)]
+    assert (np.max(between, axis=0) <= pulses.modewise(4)).all()
+    reached = max((pulses.level(s) @ largest).max() for s in GRID * np.linspace(0, 1, 65))
+    assert bound.max() < 1.1 * reached  # what is between the instants is a few percent
 
 
 def test_refusals_name_the_mode_and_the_number_of_shapes() -> None:

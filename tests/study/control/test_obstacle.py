@@ -68,6 +68,8 @@ def test_explain_names_the_program_that_control_solves() -> None:
     for key in ("N", "grid", "intervals", "variables", "rows"):
         assert getattr(sizes, key) == found[key]
     assert found["margin"]["reduced_plant"] == 1e-3
+    assert not found["certified"]  # a number is no bound
+    assert "control.constraints.margin is a number" in found["reason"]
 
 
 @pytest.mark.parametrize(
