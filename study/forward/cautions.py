@@ -57,6 +57,22 @@ def turned(angle: float) -> list[str]:
     return [f"An angle of {angle:.3g} rad is not small: the linearised rotation stretches by {angle**2 / 2:.1%}."]
 
 
+def small_obstacles(model: Model) -> list[str]:
+    """Obstacles that contact can miss between two boundary nodes. Collective."""
+    if not model.scene.effects.obstacles:
+        return []
+    from softgrasp.fem.model.surface import node_distance  # only scenes with contact pay for it
+    from softgrasp.fem.obstacles import make_obstacles
+
+    between = node_distance(model.space)
+    return [
+        f"Obstacle '{o.name}' is {size:.2g} m {'in radius' if o.kind in ('disc', 'ball') else 'thick'}, less than the "
+        f"{between:.2g} m between boundary nodes: only nodes touch, so it can sink in between two; take smaller cells."
+        for o in make_obstacles(model.scene, model.system.layout.dimension)
+        if (size := o.shape.size()) < between * (1 - 1e-9)  # edges of equal cells differ by rounding
+    ]
+
+
 def inexact(
     drift: float, residual: float, solver: str, nu: float, rounding: float = 0.0, solves: float = 0.0
 ) -> list[str]:
@@ -103,7 +119,7 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     scene, system, d = model.scene, model.system, model.space.mesh.dimension
     poisson = poisson_ratios(system)
     Z, times = _instants(run, system)
-    texts = locking(poisson, scene.tissue.order)
+    texts = [*locking(poisson, scene.tissue.order), *small_obstacles(model)]
     omega = slowest(system, Z)
     if omega > 0:
         period = f"the slowest period that the tissue shows ({2 * np.pi / omega:.3g} s)"
