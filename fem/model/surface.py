@@ -35,6 +35,15 @@ class Surface:
         return total(self.comm, part)
 
 
+def node_distance(space: Discretisation) -> float:
+    """Largest distance of neighbouring nodes on a boundary edge [m], that of straight cells. Collective."""
+    mesh = space.V.mesh
+    mesh.topology.create_connectivity(space.mesh.dimension - 1, space.mesh.dimension)
+    facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
+    longest = mesh.comm.allreduce(mesh.h(space.mesh.dimension - 1, facets).max(initial=0.0), MPI.MAX)
+    return float(longest / space.V.element.basix_element.degree)
+
+
 def make_surface(space: Discretisation, system: BlockSystem) -> Surface:
     """The free boundary of a model. Collective."""
     mesh, layout = space.V.mesh, system.layout

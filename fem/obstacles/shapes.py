@@ -34,6 +34,10 @@ class Shape(ABC):
     def support(self, n: Array) -> float:
         """Largest n.y over the shape [m] for a direction n (d,), infinite where there is none."""
 
+    @abstractmethod
+    def size(self) -> float:
+        """Radius of a ball, else the least distance of a face from the farthest corner [m], infinite without one."""
+
 
 @dataclass(frozen=True)
 class HalfSpace(Shape):
@@ -51,6 +55,10 @@ class HalfSpace(Shape):
         length = float(np.linalg.norm(n))
         along = float(n @ self.normal)
         return along * self.offset if length - along <= PARALLEL * length else math.inf
+
+    def size(self) -> float:
+        """See :meth:`Shape.size`."""
+        return math.inf
 
 
 @dataclass(frozen=True)
@@ -71,6 +79,10 @@ class Ball(Shape):
     def support(self, n: Array) -> float:
         """See :meth:`Shape.support`."""
         return float(self.center @ n + self.radius * np.linalg.norm(n))
+
+    def size(self) -> float:
+        """See :meth:`Shape.size`."""
+        return self.radius
 
 
 @dataclass(frozen=True)
@@ -132,3 +144,7 @@ class Polytope(Shape):
     def support(self, n: Array) -> float:
         """See :meth:`Shape.support`."""
         return float((self.corners @ n).max())
+
+    def size(self) -> float:
+        """See :meth:`Shape.size`."""
+        return float((self.offsets - (self.corners @ self.normals.T).min(axis=0)).min())

@@ -9,6 +9,7 @@ from softgrasp.fem.effects.gate import SMALL_SHARE
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.scales import SMALL_STRAIN, gradient, magnified, slowest
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.motion import motion_table
 from softgrasp.fem.run.snapshots import spread
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.materials import young_poisson
@@ -22,6 +23,8 @@ SMALL_ANGLE = 0.1  # [rad]: a linearised rotation stretches by angle^2 / 2, here
 EXACT = 1e-9  # a well conditioned direct solve leaves a drift of 1e-16 to 1e-12 and a residual below 1e-13
 ITERATED = 1e-3  # residual of an iterated step, or estimated error of all, up to which nothing is said
 LOOKED_AT = 25  # stored instants that strain and frequency are taken from,
+PATH_INSTANTS = 200  # of the motion, at which the gap before obstacles is taken
+OVERSHOOT = 2.0  # of the response of an undamped mode to a sudden load, against the static one
 LARGEST = 4_000_000  # fewer where they would be more numbers than this: their products need as much again
 
 
@@ -55,6 +58,51 @@ def turned(angle: float) -> list[str]:
     if angle <= SMALL_ANGLE:
         return []
     return [f"An angle of {angle:.3g} rad is not small: the linearised rotation stretches by {angle**2 / 2:.1%}."]
+
+
+def small_obstacles(model: Model) -> list[str]:
+    """Obstacles that contact can miss between two boundary nodes. Collective."""
+    if not model.scene.effects.obstacles:
+        return []
+    from softgrasp.fem.model.surface import node_distance  # only scenes with contact pay for it
+    from softgrasp.fem.obstacles import make_obstacles
+
+    between = node_distance(model.space)
+    return [
+        f"Obstacle '{o.name}' is {size:.2g} m {'in radius' if o.kind in ('disc', 'ball') else 'thick'}, less than the "
+        f"{between:.2g} m between boundary nodes: only nodes touch, so it can sink in between two; take smaller cells."
+        for o in make_obstacles(model.scene, model.system.layout.dimension)
+        if (size := o.shape.size()) < between * (1 - 1e-9)  # edges of equal cells differ by rounding
+    ]
+
+
+def out_of_reach(model: Model, strain: float, length: float) -> list[str]:
+    """Obstacles that a body which moves with the hand stays clear of by more than it deforms. Collective.
+
+    The gap is that of its boundary nodes at `PATH_INSTANTS` instants of a prescribed motion, and the deformation is
+    estimated as `OVERSHOOT` times ``strain``, the static rms gradient under the largest load [1], times ``length`` [m].
+    """
+    scene, system = model.scene, model.system
+    if not scene.effects.obstacles or scene.motion.drive == "force":
+        return []
+    from softgrasp.fem.model.surface import make_surface  # only scenes with contact pay for it
+    from softgrasp.fem.obstacles import make_obstacles
+
+    surface, q = make_surface(model.space, system), motion_table(scene, system.layout.n_s).q
+    instants, dt = spread(len(q), PATH_INSTANTS).tolist(), scene.time_end / scene.time.steps
+    obstacles = make_obstacles(scene, system.layout.dimension)
+    gap = min(
+        float(o.gap(surface.X + (surface.T @ q[n]).reshape(surface.X.shape), n * dt).min())
+        for n in instants
+        for o in obstacles
+    )
+    margin = OVERSHOOT * strain * length
+    if gap <= margin:
+        return []
+    return [
+        f"On the path of the hand the undeformed body stays {gap:.2g} m from every obstacle, and its deformation is "
+        f"estimated at {margin:.2g} m at most: nothing should touch; set effects.obstacles = false."
+    ]
 
 
 def inexact(
@@ -103,7 +151,7 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     scene, system, d = model.scene, model.system, model.space.mesh.dimension
     poisson = poisson_ratios(system)
     Z, times = _instants(run, system)
-    texts = locking(poisson, scene.tissue.order)
+    texts = [*locking(poisson, scene.tissue.order), *small_obstacles(model)]
     omega = slowest(system, Z)
     if omega > 0:
         period = f"the slowest period that the tissue shows ({2 * np.pi / omega:.3g} s)"

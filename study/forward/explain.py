@@ -25,7 +25,15 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT, factor_on_every_rank
 from softgrasp.study.forward.accuracy import estimate_error
-from softgrasp.study.forward.cautions import coarse, locking, looked_at, poisson_ratios, turned
+from softgrasp.study.forward.cautions import (
+    coarse,
+    locking,
+    looked_at,
+    out_of_reach,
+    poisson_ratios,
+    small_obstacles,
+    turned,
+)
 from softgrasp.study.forward.result import ModelSizes, model_sizes, output_places
 from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.files import to_json
@@ -174,7 +182,12 @@ def explain_model(model: Model) -> Explanation:
         missing=tuple(key for key, r in reports.items() if not r.on and r.gate.matters),
         idle=tuple(key for key, r in reports.items() if r.on and not r.gate.matters),
         sag=problem.sag,
-        warnings=(*model.space.mesh.notes, *_warnings(scene, poisson, omega, dt, d, reports, problem.sag)),
+        warnings=(
+            *model.space.mesh.notes,
+            *_warnings(scene, poisson, omega, dt, d, reports, problem.sag),
+            *small_obstacles(model),
+            *out_of_reach(looked, problem.response.rms, problem.length),
+        ),
         outputs=output_places(model),
         memory=need(scene, d, sizes.cells, ranks, layout.comm.allreduce(free_bytes(scene), MPI.MIN), run=True),
         forecasts=forecasts(model),

@@ -20,7 +20,7 @@ from softgrasp.fem.run.frames import FRAMES, LIGHT, frame_count
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estimate_error
-from softgrasp.study.forward.cautions import looked_at, run_warnings
+from softgrasp.study.forward.cautions import looked_at, run_warnings, small_obstacles
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import speed_up
@@ -60,7 +60,7 @@ def run_simulate(
     model = session.model(scene)
     model.system.release()
     scene, frames, n_e = model.scene, Frames(model, out, session.pictures), model.system.layout.n_e
-    for text in filter(None, (told(forecasts(model)), _few_fields(scene, n_e))):
+    for text in filter(None, (told(forecasts(model)), _few_fields(scene, n_e), *small_obstacles(model))):
         console.print(text, soft_wrap=True)
 
     def join(run: Run) -> None:
