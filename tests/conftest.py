@@ -110,7 +110,7 @@ def _collect_petsc_objects() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="module")
 def _keep_what_is_left() -> Iterator[None]:
-    """What a module's tests have loaded stays too: collections would look through it, half of the time of tests of studies."""
+    """What a module's tests have loaded stays: collections looked through it, half of the time of studies' tests."""
     yield
     gc.collect()
     gc.freeze()
