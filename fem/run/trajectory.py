@@ -32,6 +32,7 @@ class Trajectory(Shown, FullOrderRun):
     """
 
     LOAD: ClassVar[str] = "force"
+    """Field of the force on the hand."""
     times: Array
     """Time grid, on every rank, (steps + 1,) [s]."""
     q_s: Array

@@ -54,6 +54,7 @@ class LoopTrajectory(Shown, FullOrderRun):
     """Result of a closed-loop run; small arrays are on every rank."""
 
     LOAD: ClassVar[str] = "inputs"
+    """Field of the force on the hand."""
     times: Array
     """Time grid [s], (steps + 1,)."""
     q_s: Array

@@ -39,14 +39,14 @@ Y = np.stack([2.0 * (1 - np.exp(-TIMES) * np.cos(9 * TIMES)), 1.0 - np.exp(-TIME
 U = np.stack([np.exp(-TIMES[:-1]), -3.0 * np.exp(-TIMES[:-1])], axis=1)
 
 
-def test_histories_show_the_numbers(tmp_path: Path, drawn: list[Any]) -> None:
+def test_histories_show_the_numbers(tmp_path: Path) -> None:
     figure = histories(
         TIMES, Y, U, hand_columns(2, 2, "tip"), target=[2.0, 1.0], limits=2.0, settle=10.0, others={"N = 8": (Y, U)}
     )
     files = save(figure, tmp_path / "h.png")
     assert [f.suffix for f in files] == [".png"]
     assert np.asarray(Image.open(files[0])).std() > 1  # not one colour
-    top, force, distance = drawn[0].axes
+    top, force, distance = figure.axes
     assert np.array_equal(top.lines[0].get_ydata(), Y[:, 0])
     assert top.get_xlim() == (0.0, 10.0)
     assert distance.get_xlim() == (0.0, 30.0)
