@@ -15,6 +15,7 @@ from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.owned import remove_own
 from softgrasp.fem.scene.control import Loop
+from softgrasp.fem.solve.stiffness import sharing_factors
 from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import Design, design
 from softgrasp.lqr.design.linearise import finite_problem, linearised
@@ -66,10 +67,13 @@ def run_control(
             exists = session.comm.bcast(restart.exists())
             word = "going on from" if exists else "interrupted, the same command goes on from"
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
-        feedback = design(linearised(model), watch, solver_bar(bar, model), restart)
-        if gain_only:
-            study = small_study(feedback, watch, sentence)
-        else:
+        plant = linearised(model)
+        study: GainStudy | None = None
+        with sharing_factors(plant.system):
+            feedback = design(plant, watch, solver_bar(bar, model), restart)
+            if gain_only:
+                study = small_study(feedback, watch, sentence)
+        if study is None:
             study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence)
             if retune:
                 study = with_retuning(model, study, watch, bar)
@@ -132,7 +136,7 @@ def loop_study(
         reason = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
     else:
         sizes, reason = orders(feedback)
-        with watch.stage("reduced"):
+        with watch.stage("reduced"), sharing_factors(feedback.problem.system):
             bases = measure.timed_gains(feedback, sizes, counted(bar, "reduced equations"))
         with watch.stage("bounds"):
             bases = bases_with_bounds(feedback, bases, duration, counted(bar, "duality gaps"))
