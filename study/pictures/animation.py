@@ -14,9 +14,7 @@ import numpy.typing as npt
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from softgrasp.fem.columns import Array
-from softgrasp.fem.fields.picture import PictureMesh
-from softgrasp.fem.owned import note
+from softgrasp.fem import Array, PictureMesh, note
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, legend, make_axes, make_shot, name_layers
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.pictures.style import TARGET, colour_map, fit, paper_style

@@ -8,8 +8,7 @@ import numpy as np
 from matplotlib.patches import Circle, Polygon
 from scipy.spatial import ConvexHull
 
-from softgrasp.fem.obstacles import Ball, HalfSpace, Polytope, Shape
-from softgrasp.fem.petsc import Array
+from softgrasp.fem import Array, Ball, HalfSpace, Polytope, Shape
 from softgrasp.study.pictures.style import OUTLINE
 
 OBSTACLE: dict[str, Any] = {"facecolor": "#d9d9d9", "edgecolor": OUTLINE, "lw": 0.8, "zorder": 0.5}
