@@ -220,6 +220,6 @@ def test_a_start_inside_and_a_hand_that_meets_an_obstacle_are_refused() -> None:
     with pytest.raises(SceneError, match=r"obstacle 'disc1' holds the node of the tissue at .* m deep; move it"):
         run("obstacle=[{kind='disc', center=[0.5, 0.2], radius=0.3}]")
     model = build("paper_forward", [*SMALL, ON, TABLE])
-    held = model.system.layout.held[0].tolist()
+    held = np.concatenate(MPI.COMM_WORLD.allgather(model.system.layout.held))[0].tolist()
     with pytest.raises(SoftgraspError, match="the hand meets obstacle 'disc1' at t = 0 s"):
         run(f"obstacle=[{{kind='disc', center={held}, radius=0.01}}]")
