@@ -310,7 +310,7 @@ def read_reconstruction(file: h5py.File, layout: BlockLayout) -> Reconstruction:
 
     path, d, group = file.filename, layout.dimension, _group(file)
     if group not in file:
-        raise ModelError(f"{path} holds no basis on the mesh; load it without a layout, or reduce the scene again")
+        raise ModelError(f"{path} has no basis on the mesh; load it without a layout, or reduce the scene again")
     nodes = file[f"{group}/nodes"][()]
     if nodes.shape != (layout.n_e // d, d):
         raise ModelError(

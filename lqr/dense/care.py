@@ -52,7 +52,7 @@ def care(A: Array, B: Array, C: Array, Q: Array, R: Array, E: Array | None = Non
     work is 25 (2n)^3 operations; memory some 20 n^2. Inputs are not changed.
 
     Args:
-        A, E: (n, n), E regular; None stands for I.
+        A, E: (n, n), E regular; None: I.
         B, C: (n, m) and (p, n).
         Q, R: (p, p), symmetric positive semidefinite, and (m, m), symmetric positive definite.
 
@@ -364,5 +364,5 @@ def check_seen(A: Array, G: Array, H: Array, omega: float) -> None:
     if smallest_singular_value(hamiltonian, 1j * omega) <= UNSEEN * float(np.linalg.norm(hamiltonian)):
         raise ControlError(
             f"the reduced equation of order {len(A)} has a solution by rounding alone: a mode that does not decay by "
-            "itself is not reached by the inputs or not seen by the outputs; take another order N"
+            "itself is not reached by the inputs or not seen by the outputs; use another order N"
         )

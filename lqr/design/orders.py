@@ -114,7 +114,7 @@ def _ranked(design: Design, bases: Sequence[BasisGains]) -> list[BasisGains]:
 
 
 def certified(design: Design, bases: Sequence[BasisGains], sizes: range | None = None) -> list[BasisGains]:
-    """With the full plant asked for the spectrum of the best gain of every basis, or the next best. Collective.
+    """The reduced gains, the best of every basis (or the next best) checked by the full plant's spectrum. Collective.
 
     ``sizes``: orders of the gains that are offered; None for any.
     """

@@ -107,7 +107,7 @@ def duality_gaps(
     Args:
         problem: plant, outputs and weights; it has a hand.
         gains: u = u_bar + K_hat (x - x_bar) as the course samples, holds, delays and limits it.
-        solution: Z, and the optimal law, whose own run gives the best lower bound of the least cost; None takes the
+        solution: Z, and the optimal law, whose own run gives the best lower bound of the least cost; None: with the
             cost up to the end alone.
         notify: called with the number of steps done and in all.
 

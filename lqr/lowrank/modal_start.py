@@ -63,7 +63,7 @@ def plant_modes(plant: Plant, k: int) -> tuple[Array, Array]:
     key = (system.K_ee.handle, system.K_ee.stateGet(), system.M_ee.handle, system.M_ee.stateGet(), plant.M_s.tobytes())
     kept = system.kept.get("floating modes")
     if kept is None or kept[0] != key or len(kept[1]) < k:
-        most = max(k, min(MORE_MODES, system.layout.n_e))  # the certificate asks for them after the start of a solver
+        most = max(k, min(MORE_MODES, system.layout.n_e))  # the certificate requests them after the start of a solver
         kept = key, *_floating(plant, most), system.K_ee, system.M_ee  # no other matrix can take their handles
         if most * system.layout.n_e <= KEPT_ENTRIES:
             system.kept["floating modes"] = kept
@@ -195,7 +195,7 @@ def check_damped(plant: Plant) -> None:
 def modal_start(plant: Plant, modes: int | None = None) -> ModalStart:
     """Riccati equation of the hand and the lowest ``modes`` modes. Collective.
 
-    ``modes``: number of modes, 0 for the hand alone; None takes :data:`MODES`, or more when damping is light.
+    ``modes``: number of modes, 0 for the hand alone; None: :data:`MODES`, or more when damping is light.
 
     Raises ControlError: there is no damping at all, or the small problem has no stabilising solution.
     """

@@ -368,7 +368,7 @@ def make_shifted(system: BlockSystem, name: str = "auto") -> ShiftedTissue:
 
 
 def shifted_factor_bytes(n: int, dimension: int) -> float:
-    """What MUMPS asks for to factor S(p) of order n, all ranks together: 240 n log2 n in 2D, 800 n^(4/3) in 3D.
+    """Memory of MUMPS to factor S(p) of order n, all ranks together: 240 n log2 n in 2D, 800 n^(4/3) in 3D.
 
     Fitted to n = 6 558 to 103 038 in 2D and n = 7 227 to 52 857 in 3D.
     """
@@ -382,5 +382,5 @@ def check_shifted_memory(layout: BlockLayout) -> None:
     if needed > free:
         raise ResourceError(
             f"the factor of the shifted tissue matrix (n_e = {layout.n_e} in {layout.dimension}D) needs about "
-            f"{needed:.1f} GiB and {free:.1f} GiB are free; take fewer cells, or set {MODAL_KEY}"
+            f"{needed:.1f} GiB and {free:.1f} GiB are free; use fewer cells, or set {MODAL_KEY}"
         )

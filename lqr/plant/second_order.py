@@ -32,8 +32,8 @@ def second_order(
         matrices: mass M, damping D and stiffness K, AIJ matrices (n_e, n_e).
         B: forces of unit inputs, local rows (n_local, m).
         C: outputs of the displacement, transposed, local rows (n_local, p).
-        Q: weight of the outputs, (p, p), symmetric positive semidefinite; None stands for I.
-        R: weight of the inputs, (m, m), symmetric positive definite; None stands for I.
+        Q: weight of the outputs, (p, p), symmetric positive semidefinite; None: I.
+        R: weight of the inputs, (m, m), symmetric positive definite; None: I.
         damping: coefficients of D = alpha M + beta K, which leaves modes uncoupled; the matrix D is ignored then.
 
     Returns:

@@ -20,7 +20,7 @@ modes fixed, N = 18: 14 vectors beside the hand's four:
     PSD SVD-like                      4.3e-5     4.3e-5    4.3e-5
 
 The last is symplectic, not orthonormal: its pairs hardly depend on the product. Hence canonical bases beyond the
-paper's six are built in the energy product unless another is asked for.
+paper's six are built in the energy product unless another is requested.
 """
 
 from __future__ import annotations

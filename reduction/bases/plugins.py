@@ -95,7 +95,7 @@ def load_plugins(files: Sequence[Path]) -> tuple[str, ...]:
             raise BasisError(f"{file}: it must set METHODS, a list of softgrasp.reduction.bases.plugins' methods")
         for method in found:
             if method.key in METHODS:
-                raise BasisError(f"{file}: '{method.key}' is the name of a shipped basis; take another")
+                raise BasisError(f"{file}: '{method.key}' is the name of a shipped basis; use another")
             OWN_METHODS[method.key] = method
             keys.append(method.key)
     return tuple(keys)

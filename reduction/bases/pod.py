@@ -27,7 +27,7 @@ class PartsRequest:
     coordinates: Coordinates  # "qv" or "qp"
     inner: InnerName  # inner product
     engine: EngineName  # engine of the tall factorisation
-    count: int | None  # largest N asked for, None when only shares of energy are
+    count: int | None  # largest N requested, None when only shares of energy are
     share: float | None  # smallest share of sum sigma^2 that may be dropped, None when only N are given
 
     @property

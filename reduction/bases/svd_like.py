@@ -169,7 +169,7 @@ def symplectic_repair(B: Array) -> Array:
         return np.linalg.inv(np.real(scipy.linalg.sqrtm(-apply_j(B))))
     except np.linalg.LinAlgError as error:
         raise BasisError(
-            "SVD-like pairs of these snapshots are linearly dependent to rounding; take a smaller N or another basis"
+            "SVD-like pairs of these snapshots are linearly dependent to rounding; use a smaller N or another basis"
         ) from error
 
 

@@ -104,7 +104,7 @@ def load_certified(path: str | Path, layout: BlockLayout | None = None) -> Certi
         group = file.get(GROUP)
         if group is None or group.attrs.get("format") != FORMAT:
             raise ModelError(
-                f"{path} holds no certificate of this version ({FORMAT!r}); "
+                f"{path} has no certificate of this version ({FORMAT!r}); "
                 "build it by softgrasp reduce SCENE --tolerance"
             )
         return CertifiedModel(read_linear(file, data, layout), **_read(group))

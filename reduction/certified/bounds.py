@@ -28,7 +28,7 @@ def node_average(rows: Array, first: Array | None = None, nodes: Array | None = 
 
     Args:
         rows: values at the midpoints, (w, steps).
-        first: node value at the start, (w,); None takes the first midpoint value.
+        first: node value at the start, (w,); None: the first midpoint value.
         nodes: array for the node values; None makes one.
     """
     nodes = np.empty((len(rows), rows.shape[1] + 1)) if nodes is None else nodes

@@ -168,10 +168,10 @@ class CertifiedModel(Shown):
         """A run of the small basis with its certificate. Online; not collective.
 
         Args:
-            materials: one per layer; None takes those of the projection.
-            drive: what moves the hand; None takes the scene's motion.
-            tolerance: relative; None takes that of the model.
-            gravity: acceleration of free fall (n_s,) [m/s^2]; None takes that of the scene.
+            materials: one per layer; None: those of the projection.
+            drive: what moves the hand; None: the scene's motion.
+            tolerance: relative; None: that of the model.
+            gravity: acceleration of free fall (n_s,) [m/s^2]; None: that of the scene.
             allow: return a run above the tolerance too.
             prove_time_step: prove the error of the step as well, by a second certified run at the finer step.
 

@@ -145,7 +145,7 @@ class Orthonormal:
 
     Args:
         system: system of the tissue, for the distribution of the rows and the choice of the solver.
-        W: matrix of the norm, symmetric positive definite; None stands for W^-1 = ``product``.
+        W: matrix of the norm, symmetric positive definite; None: W^-1 = ``product``.
         product: matrix W^-1 itself, which needs no solver; None where W is given.
     """
 
