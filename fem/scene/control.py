@@ -199,7 +199,7 @@ class Constraints(Section):
     )
     penalty: Literal["auto"] | Positive = Field(
         "auto",
-        description="cost of a metre inside an obstacle where no plan keeps all gaps [1/m]; auto: ten times the mean "
+        description="cost of a metre inside an obstacle where no plan keeps all gaps [1/m]; auto: twenty times the mean "
         "cost of a metre of the way",
     )
 
