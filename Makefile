@@ -10,7 +10,7 @@ STAMP := .venv/.stamp
 .PHONY: help env demo paper_forward paper_accurate test test-all check lint bench hardcases paper pictures docs docs-serve clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
 
 env: $(STAMP) ## make .venv with everything needed (redone when pyproject.toml changes)
 

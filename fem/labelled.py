@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from softgrasp.fem.columns import Array, Columns, hand_of
+from softgrasp.fem.columns import Array, Columns, hand_of, labels
 from softgrasp.fem.errors import SoftgraspError
 
 
@@ -47,16 +48,16 @@ def of_columns(values: Array, columns: Columns, dimension: str, *, rate: str = "
     return Quantity(values, labels, units, dimension, mid=load)
 
 
-class Labelled:
+class Labelled(ABC):
     """A run whose quantities over time have labels and units."""
 
     times: Array
     """Time grid, (steps + 1,) [s]."""
 
     @property
+    @abstractmethod
     def quantities(self) -> dict[str, Quantity]:
         """What there is over time, by the name of the field."""
-        raise NotImplementedError
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -96,6 +97,40 @@ class Labelled:
             for j, (label, unit) in enumerate(zip(q.labels, q.units, strict=True)):
                 columns[f"{name} {label} [{unit}]"] = values[:, j]
         return pandas.DataFrame(columns, index=pandas.Index(self.times, name="time [s]"))
+
+
+class FullOrderRun(Labelled):
+    """A run of the full model, whose outputs have columns."""
+
+    LOAD: ClassVar[str]
+    """Name of the field that holds the force on the hand in each step."""
+    outputs: Array
+    """Outputs, (steps + 1, p) [m, rad]."""
+    outputs_rigid: Array
+    """Outputs of tissue that moves rigidly with the hand, (steps + 1, p) [m, rad]."""
+    columns: Columns
+    """Name, axis and unit of each output component, p."""
+    q_s: Array
+    """Displacement of the hand, (steps + 1, n_s) [m, rad]."""
+    v_s: Array
+    """Velocity of the hand, (steps + 1, n_s) [m/s, rad/s]."""
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """Labels of the columns."""
+        return labels(self.columns)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Outputs, hand and its force over time with their labels and units."""
+        names = self.output_names
+        return {
+            "outputs": of_columns(self.outputs, self.columns, "output"),
+            "outputs_rigid": of_columns(self.outputs_rigid, self.columns, "output"),
+            "q_s": of_hand(self.q_s, names),
+            "v_s": of_hand(self.v_s, names, rate="/s"),
+            self.LOAD: of_hand(getattr(self, self.LOAD), names, load=True),
+        }
 
 
 def table(rows: Iterable[Mapping[str, Any]]) -> Any:

@@ -26,13 +26,12 @@ from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.reduce import errors, replay
 from softgrasp.study.control.plots import bode
-from softgrasp.study.pictures.animation import move_bytes
+from softgrasp.study.pictures.animation import MOST_FRAMES, move_bytes
 from softgrasp.study.pictures.loop import histories
 from softgrasp.study.pictures.style import CYCLE, FULL, WIDTH, length_unit, log_axis, paper_style
 from softgrasp.study.pictures.traces import traces
 
 FREQUENCIES = 800  # of a Bode diagram, even in log w
-FILM_FRAMES = 60
 
 
 def _free(figure: Any) -> Any:
@@ -137,7 +136,7 @@ def animation(run: Trajectory, model: Model) -> Film:
     kept = run.snapshots
     if kept is None:
         raise SoftgraspError("the run kept no snapshots in memory; set output.snapshots = 'memory'")
-    pick = np.unique(np.linspace(0, len(kept.steps) - 1, FILM_FRAMES).round().astype(int))
+    pick = np.unique(np.linspace(0, len(kept.steps) - 1, MOST_FRAMES).round().astype(int))
     n = kept.layout.n_local
     picture, states = gather_picture(model), vertex_displacement(model, kept.Z[:n, pick], kept.q_s[:, pick])
     if picture is None or states is None:

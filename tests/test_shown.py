@@ -123,6 +123,8 @@ def test_a_sweep_from_python_is_the_runs_one_by_one() -> None:
     assert "2, of them 0 refused" in repr(table)
     with pytest.raises(SceneError, match=r"tissue\.material\.nu is not a key"):
         sg.sweep("paper_forward", {"tissue.material.nu": [0.3]})
+    with pytest.raises(SceneError, match=r"tissue\.material\.mu needs a list of values"):
+        sg.sweep("paper_forward", {"tissue.material.mu": 20.0})  # type: ignore[dict-item]
     with pytest.raises(SceneError, match="has 0 points"):
         sg.sweep("paper_forward", {"tissue.material.mu": []})
 

@@ -10,7 +10,6 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from softgrasp.fem.model.assembly import Discretisation
-from softgrasp.fem.model.contact import contact_blocks
 from softgrasp.fem.petsc import Array, rows_on_all, total
 from softgrasp.fem.system import BlockSystem
 
@@ -25,6 +24,10 @@ class Surface:
     dofs: NDArray[np.intp]  # numbers among all tissue unknowns, (p d,)
     mine: NDArray[np.intp]  # places here of the unknowns that this rank owns
     rows: NDArray[np.intp]  # rows of those among the owned ones
+
+    def places(self, q: Array, z: Array | float = 0.0) -> Array:
+        """Coordinates of the nodes with the hand at q (n_s,) and displacements z (p d,) of the tissue, (p, d) [m]."""
+        return self.X + (z + self.T @ q).reshape(self.X.shape)
 
     def gather(self, x: Array) -> Array:
         """Values (p d,) of a vector given by its owned rows. Collective."""
@@ -46,12 +49,9 @@ def node_distance(space: Discretisation) -> float:
 
 def make_surface(space: Discretisation, system: BlockSystem) -> Surface:
     """The free boundary of a model. Collective."""
-    mesh, layout = space.V.mesh, system.layout
-    d = layout.dimension
-    mesh.topology.create_connectivity(d - 1, d)
-    outer, _ = contact_blocks(space.V, np.sort(dolfinx.mesh.exterior_facet_indices(mesh.topology)))
-    nodes = np.flatnonzero(np.isin(space.free, outer))
-    rows = (nodes[:, None] * d + np.arange(d)).ravel()
+    layout = system.layout
+    nodes = np.flatnonzero(space.surface()[0])
+    rows = (nodes[:, None] * layout.dimension + np.arange(layout.dimension)).ravel()
     dofs = rows_on_all(layout.comm, layout.start + rows)
     first = sum(layout.comm.allgather(len(rows))[: layout.comm.rank])
     mine = np.arange(first, first + len(rows))

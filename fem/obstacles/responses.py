@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,9 @@ class Responses:
             feels no tissue.
 
     Attributes:
-        columns: response of every key here, (rows here, capacity), the first ``count`` of them.
+        keys: boundary node and direction of every column, by their numbers, (capacity, 2), the first ``count`` of them.
+        where: column of every key.
+        columns: response of every key here, (rows here, capacity).
         surface: the same on the boundary, (p d, capacity).
         G: directions times responses, with the hand's part where it is two-way, (capacity, capacity).
         B: directions times reach, (capacity, n_s).
@@ -38,11 +40,16 @@ class Responses:
     ) -> None:
         self.directions, self.respond, self.size, self.reach = directions, respond, size, reach
         self.d = directions.shape[1]
-        self.keys: list[Key] = []
+        self.keys = np.zeros((0, 2), dtype=int)
         self.where: dict[Key, int] = {}
         self.columns, self.surface = np.zeros((0, 0), order="F"), np.zeros((size, 0), order="F")
         self.G = np.zeros((0, 0))
         self.B = np.zeros((0, 0 if reach is None else len(reach[1])))
+
+    @property
+    def count(self) -> int:
+        """Number of columns [1]."""
+        return len(self.where)
 
     def enter(self, keys: list[Key]) -> None:
         """Make the columns of the keys that have none, in the order given. Collective."""
@@ -55,13 +62,12 @@ class Responses:
         n, force = self.directions[direction], np.zeros(self.size)
         force[node * self.d : (node + 1) * self.d] = n
         column, there = self.respond(force)
-        k = len(self.keys)
+        k = self.count
         if k == len(self.G):
             self._grow(max(16, 2 * k), len(column))
-        self.keys.append(key)
-        self.where[key] = k
+        self.keys[k], self.where[key] = key, k
         self.columns[:, k], self.surface[:, k] = column, there
-        nodes, numbers = np.array(self.keys).T
+        nodes, numbers = self.keys[: k + 1].T
         products = np.einsum("ij,ij->i", self.directions[numbers], there.reshape(-1, self.d)[nodes])
         if self.reach is not None:
             reach, inverse = self.reach
@@ -70,24 +76,21 @@ class Responses:
         self.G[k, : k + 1] = self.G[: k + 1, k] = products
 
     def _grow(self, size: int, rows: int) -> None:
-        k = len(self.keys)
-
-        def larger(x: Array, shape: tuple[int, int]) -> Array:
-            y = np.zeros(shape, order="F" if x.flags.f_contiguous and not x.flags.c_contiguous else "C")
+        def larger(x: Array, shape: tuple[int, int], order: Literal["C", "F"] = "C") -> Array:
+            y = np.zeros(shape, x.dtype, order)
             y[: x.shape[0], : x.shape[1]] = x
             return y
 
-        columns, surface = self.columns, self.surface
-        self.columns, self.surface = np.zeros((rows, size), order="F"), np.zeros((self.size, size), order="F")
-        if k:
-            self.columns[:, :k], self.surface[:, :k] = columns[:, :k], surface[:, :k]
-        self.G, self.B = larger(self.G, (size, size)), larger(self.B, (size, self.B.shape[1]))
+        self.columns = larger(self.columns, (rows, size), "F")
+        self.surface = larger(self.surface, (self.size, size), "F")
+        self.keys, self.G = larger(self.keys, (size, 2)), larger(self.G, (size, size))
+        self.B = larger(self.B, (size, self.B.shape[1]))
 
     def forces(self, f: Array) -> Array:
         """Forces on the boundary (p d,) of strengths f (count,)."""
         total = np.zeros((self.size // self.d, self.d))
         on = np.flatnonzero(f)
         if len(on):
-            nodes, numbers = np.array(self.keys)[on].T
+            nodes, numbers = self.keys[on].T
             np.add.at(total, nodes, f[on, None] * self.directions[numbers])
         return total.ravel()

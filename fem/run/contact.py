@@ -118,10 +118,6 @@ class Contact:
         """Values on the boundary of a vector on the rows here. Collective."""
         return x[self.places] if self.whole else self.surface.gather(x)
 
-    def _at(self, z: Array, q: Array) -> Array:
-        """Places of the boundary nodes, (p, d) [m]."""
-        return self.surface.X + (z + self.surface.T @ q).reshape(self.p, self.d)
-
     def _gaps(self, x: Array, n: int) -> Array:
         return np.array([o.gap(x, n * self.dt) for o in self.obstacles])
 
@@ -141,7 +137,7 @@ class Contact:
         Raises SceneError: an obstacle is in the tissue at the start.
         """
         self.z = np.array(self.surface.gather(state.z.array_r))
-        x = self._at(self.z, q)
+        x = self.surface.places(q, self.z)
         self.gaps = self._gaps(x, n)
         self.table.gap[n] = self.gaps.min(axis=1)
         self.rows = self._make_rows(np.zeros((0, 2), dtype=int))
@@ -160,12 +156,12 @@ class Contact:
         """
         self.n, self.drive = n, drive
         self.moved = self._take(self.midpoint.w_array)
-        x1 = self._at(self.z + 2 * self.moved, drive.q[n + 1])
+        x1 = self.surface.places(drive.q[n + 1], self.z + 2 * self.moved)
         self.after = self._gaps(x1, n + 1)
         if self.after.min() >= 0:
             self.rows = self._make_rows(np.zeros((0, 2), dtype=int))
             return
-        f, self.rows = self._settle(n, self._at(self.z, drive.q[n]), x1)
+        f, self.rows = self._settle(n, self.surface.places(drive.q[n], self.z), x1)
         self._add(n, f, drive)
         rows, table = self.rows, self.table
         np.add.at(table.force[n], rows.obstacle, rows.x[:, None] * rows.normal)
@@ -215,7 +211,7 @@ class Contact:
         normals = [o.shape.normal for o in self.obstacles if isinstance(o.shape, HalfSpace)]
         rows.normal = np.array(normals)[rows.obstacle]
         rows.x = self.small.solve(k, self.W, self.after[rows.obstacle, rows.node] / 2, tol / 4).copy()
-        f = np.zeros(len(self.responses.keys))
+        f = np.zeros(self.responses.count)
         np.add.at(f, self.columns, rows.x)
         return f, rows
 
@@ -243,7 +239,7 @@ class Contact:
         rows = self._make_rows(np.argwhere(known))
         keys = [(int(i), number) for o, i in zip(rows.obstacle, rows.node, strict=True) for number in self.numbers[o]]
         self.responses.enter(keys)
-        m = len(self.responses.keys)
+        m = self.responses.count
         C, q = np.zeros((len(rows.node), m)), self.after[rows.obstacle, rows.node] / 2
         for o, obstacle in enumerate(self.obstacles):
             mine = np.flatnonzero(rows.obstacle == o)
@@ -297,7 +293,7 @@ class Contact:
         drive, rows, d = self.drive, self.rows, self.d
         assert drive is not None
         v = (self.surface.gather(state.v.array_r) + self.surface.T @ drive.v[n]).reshape(self.p, d)[rows.node]
-        x = self._at(self.z, drive.q[n])[rows.node]
+        x = self.surface.places(drive.q[n], self.z)[rows.node]
         normal = np.zeros_like(x)
         for o, obstacle in enumerate(self.obstacles):
             mine = rows.obstacle == o
@@ -358,15 +354,16 @@ class Contact:
         names = tuple(o.name for o in self.obstacles)
         return ContactRecord(
             names, table.force, table.impulse, table.gap, table.touching, work, touch, stopped, self.small.rounds,
-            len(self.responses.keys), self.p,
+            self.responses.count, self.p,
         )  # fmt: skip
 
     def restart_arrays(self) -> dict[str, Array]:
         """Record and sets of a restart file, see :class:`softgrasp.fem.run.checkpoint.RestartState`."""
         small, m = self.small, len(self.small.active)
+        keys = self.responses.keys[: self.responses.count]
         parts: list[NDArray[Any]] = [
-            self.table.energy, np.array([self.fastest]), small.tally, np.array(self.responses.keys).ravel(),
-            self.pairs.ravel(), np.array([self.rows.obstacle, self.rows.node]).ravel(), small.active,
+            self.table.energy, np.array([self.fastest]), small.tally, keys.ravel(), self.pairs.ravel(),
+            np.array([self.rows.obstacle, self.rows.node]).ravel(), small.active,
             small.L[:m, :m].ravel(),
         ]  # fmt: skip
         sizes = np.array([len(part) for part in parts])

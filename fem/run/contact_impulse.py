@@ -38,6 +38,8 @@ def stopping_impulse(
     def multiply(u: Array) -> Array:
         at.array_w[:] = u[:n]
         system.M_ee.mult(at, of)
+        if not free:
+            return np.array(of.array_r)
         return np.concatenate([of.array_r + G @ u[n:], total(comm, G.T @ u[:n]) + M_s @ u[n:]])
 
     def transpose(y: Array) -> Array:

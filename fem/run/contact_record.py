@@ -28,9 +28,9 @@ class ContactRecord:
     work: float
     """Work of the contact on the tissue in the frame of the hand, impulses included [J]."""
     touch: float
-    """Energy that the steps of first touch took, >= 0 [J]."""
+    """Energy dissipated in the steps of first touch, >= 0 [J]."""
     stopped: float
-    """Kinetic energy that the impulses took, >= 0 [J]."""
+    """Kinetic energy dissipated by the impulses, >= 0 [J]."""
     rounds: int
     """Rounds of all contact problems [1]."""
     columns: int
@@ -54,7 +54,7 @@ class Tables:
     touching: Array  # numbers of pressed nodes, (steps, obstacles)
     hand: Array  # force of the contact in the freedoms of the hand, impulses included, (steps, n_s) [N, N m]
     kick: Array  # G'u for the jump u of the velocity by each impulse, (steps, n_s) [N s, N m s]
-    energy: Array  # work, and energy taken at first touch and by impulses, (3,) [J]
+    energy: Array  # work, and energy dissipated at first touch and by impulses, (3,) [J]
 
     @staticmethod
     def empty(steps: int, obstacles: int, d: int, n_s: int) -> Tables:

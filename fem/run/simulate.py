@@ -160,9 +160,8 @@ class Run(Stepped):
         """Force on the hand in each step, see :class:`Trajectory`. Collective."""
         if self.drive.u is not None:
             return self.drive.u
-        kicks = 0.0 if self.contact is None else self.contact.table.kick
         pulls = self.pulls[1:] if self.midpoint.operators.whole else total(self.layout.comm, self.pulls[1:])
-        hand = 0.0 if self.contact is None else self.contact.table.hand
+        kicks, hand = (0.0, 0.0) if self.contact is None else (self.contact.table.kick, self.contact.table.hand)
         return force_taken(self.model.system, pulls, self.drive.v, self.drive.c, self.dt, kicks) - hand
 
     def watch_energy(self) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from softgrasp.fem.columns import Columns, labels
-from softgrasp.fem.labelled import Labelled, Quantity, of_columns, of_hand
+from softgrasp.fem.columns import Columns
+from softgrasp.fem.labelled import FullOrderRun
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, repr=False)
-class Trajectory(Shown, Labelled):
+class Trajectory(Shown, FullOrderRun):
     """Motion, outputs, force and figures of a run of the full model.
 
     >>> import softgrasp as sg
@@ -31,6 +31,8 @@ class Trajectory(Shown, Labelled):
     (61, 2)
     """
 
+    LOAD: ClassVar[str] = "force"
+    """Field of the force on the hand."""
     times: Array
     """Time grid, on every rank, (steps + 1,) [s]."""
     q_s: Array
@@ -67,6 +69,8 @@ class Trajectory(Shown, Labelled):
     """Number of steps since the run was started or resumed [1]."""
     newton: NewtonFigures | None = None
     """Convergence of the steps at finite strain; None where they are linear."""
+    contact: ContactRecord | None = None
+    """What obstacles did; None without effects.obstacles."""
 
     def card(self) -> Card:
         """Steps, outputs, deformation, energy drift, solver."""
@@ -79,17 +83,6 @@ class Trajectory(Shown, Labelled):
             ("solver", f"{self.solver.name} ({self.solver.package})"),
         )
         return Card("Trajectory of the full model", rows)
-
-    @property
-    def quantities(self) -> dict[str, Quantity]:
-        """Outputs, hand and force over time with their labels and units."""
-        return {
-            "outputs": of_columns(self.outputs, self.columns, "output"),
-            "outputs_rigid": of_columns(self.outputs_rigid, self.columns, "output"),
-            "q_s": of_hand(self.q_s, self.output_names),
-            "v_s": of_hand(self.v_s, self.output_names, rate="/s"),
-            "force": of_hand(self.force, self.output_names, load=True),
-        }
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -106,11 +99,3 @@ class Trajectory(Shown, Labelled):
         Raises SoftgraspError: the run kept no snapshots.
         """
         return drawn("animation", self, model)
-
-    contact: ContactRecord | None = None
-    """What obstacles did; None without effects.obstacles."""
-
-    @property
-    def output_names(self) -> tuple[str, ...]:
-        """Labels of the columns."""
-        return labels(self.columns)

@@ -6,14 +6,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.columns import Columns, labels
+from softgrasp.fem.columns import Columns
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.labelled import Labelled, Quantity, of_columns, of_hand
+from softgrasp.fem.labelled import FullOrderRun
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.make import make_midpoint
@@ -50,9 +50,11 @@ class LoopOptions:
 
 
 @dataclass(frozen=True, repr=False)
-class LoopTrajectory(Shown, Labelled):
+class LoopTrajectory(Shown, FullOrderRun):
     """Result of a closed-loop run; small arrays are on every rank."""
 
+    LOAD: ClassVar[str] = "inputs"
+    """Field of the force on the hand."""
     times: Array
     """Time grid [s], (steps + 1,)."""
     q_s: Array
@@ -96,17 +98,6 @@ class LoopTrajectory(Shown, Labelled):
         return Card("Trajectory of the closed loop", rows)
 
     @property
-    def quantities(self) -> dict[str, Quantity]:
-        """Outputs, hand and input over time with their labels and units."""
-        return {
-            "outputs": of_columns(self.outputs, self.columns, "output"),
-            "outputs_rigid": of_columns(self.outputs_rigid, self.columns, "output"),
-            "q_s": of_hand(self.q_s, self.output_names),
-            "v_s": of_hand(self.v_s, self.output_names, rate="/s"),
-            "inputs": of_hand(self.inputs, self.output_names, load=True),
-        }
-
-    @property
     def attributes(self) -> dict[str, Any]:
         """Cost and share of the steps with an input at its limit."""
         return {"cost": float(self.cost[-1]), "saturated": self.saturated}
@@ -114,11 +105,6 @@ class LoopTrajectory(Shown, Labelled):
     def plot(self) -> Any:
         """Outputs and inputs over time, as ``matplotlib`` figure."""
         return drawn("loop", self)
-
-    @property
-    def output_names(self) -> tuple[str, ...]:
-        """Labels of the columns."""
-        return labels(self.columns)
 
 
 class ClosedLoop:

@@ -20,7 +20,7 @@ from softgrasp.study.control.result import TITLES, ControlStudy, LoopRuns, Retun
 from softgrasp.study.pictures import style
 from softgrasp.study.pictures.body import figure_move
 from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.pictures.loop import Poles, figure_decay, figure_histories
+from softgrasp.study.pictures.loop import Poles, figure_decay, histories
 
 LOOKS = {
     "pod": (style.BLUE, "-", "o"),
@@ -154,11 +154,11 @@ def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Fr
     """All figures but that of the re-tuning, and the animation. Rank 0 only."""
     design, loops, full = study.design, study.loops, study.loops.full
     files = _move(out, study, frames) if frames.picture is not None and frames.states else []
-    files += figure_histories(
-        full.times, full.outputs, full.inputs, full.columns, out / "histories.png", target=design.target.y,
-        limits=loops.limits, others=compared(loops), settle=loops.plan.settle,
-        dimension=design.problem.layout.dimension,
+    figure = histories(
+        full.times, full.outputs, full.inputs, full.columns, target=design.target.y, limits=loops.limits,
+        others=compared(loops), settle=loops.plan.settle, dimension=design.problem.layout.dimension,
     )  # fmt: skip
+    files += style.save(figure, out / "histories.png")
     if any(b.reports for b in study.bases):
         files += figure_gains(study.bases, out / "errors.png")
     if study.margins is not None:

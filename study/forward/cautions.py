@@ -23,9 +23,9 @@ SMALL_ANGLE = 0.1  # [rad]: a linearised rotation stretches by angle^2 / 2, here
 EXACT = 1e-9  # a well conditioned direct solve leaves a drift of 1e-16 to 1e-12 and a residual below 1e-13
 ITERATED = 1e-3  # residual of an iterated step, or estimated error of all, up to which nothing is said
 LOOKED_AT = 25  # stored instants that strain and frequency are taken from,
-PATH_INSTANTS = 200  # of the motion, at which the gap before obstacles is taken
-OVERSHOOT = 2.0  # of the response of an undamped mode to a sudden load, against the static one
 LARGEST = 4_000_000  # fewer where they would be more numbers than this: their products need as much again
+PATH_INSTANTS = 200  # instants of a prescribed motion at which the gap to obstacles is computed
+OVERSHOOT = 2.0  # largest response of an undamped mode to a sudden load, over the static one
 
 
 def poisson_ratios(system: BlockSystem) -> dict[str, float]:
@@ -91,11 +91,8 @@ def out_of_reach(model: Model, strain: float, length: float) -> list[str]:
     surface, q = make_surface(model.space, system), motion_table(scene, system.layout.n_s).q
     instants, dt = spread(len(q), PATH_INSTANTS).tolist(), scene.time_end / scene.time.steps
     obstacles = make_obstacles(scene, system.layout.dimension)
-    gap = min(
-        float(o.gap(surface.X + (surface.T @ q[n]).reshape(surface.X.shape), n * dt).min())
-        for n in instants
-        for o in obstacles
-    )
+    places = ((n * dt, surface.places(q[n])) for n in instants)
+    gap = min(float(o.gap(x, t).min()) for t, x in places for o in obstacles)
     margin = OVERSHOOT * strain * length
     if gap <= margin:
         return []

@@ -151,7 +151,8 @@ class Frames:
         from softgrasp.study.pictures.animation import gif_move  # these bring Matplotlib
         from softgrasp.study.pictures.background import draw_in_background
         from softgrasp.study.pictures.body import figure_move
-        from softgrasp.study.pictures.traces import figure_traces
+        from softgrasp.study.pictures.style import save
+        from softgrasp.study.pictures.traces import traces
 
         picture, target = self.picture, self.model.scene.motion.target
         table, states, times = np.column_stack([run.times, run.q_s]), np.stack(self.states), np.array(self.times)
@@ -161,11 +162,9 @@ class Frames:
 
         moved = draw_in_background(self.model.system.layout.comm, directory, moving)
         files = [*figure_move(picture, states, times, table, target, directory / "move.png")]
-        files += figure_traces(
-            run.times, run.outputs, run.columns, run.q_s, directory / "traces.png", rigid=run.outputs_rigid,
-            dimension=picture.dimension,
-        )  # fmt: skip
-        return files + moved()
+        rigid, d = run.outputs_rigid, picture.dimension
+        figure = traces(run.times, run.outputs, run.columns, run.q_s, rigid=rigid, dimension=d)
+        return [*files, *save(figure, directory / "traces.png"), *moved()]
 
 
 def _series(begun: int) -> str:

@@ -43,18 +43,6 @@ class _Panel:
     inputs: bool = False
 
 
-def figure_histories(
-    times: Array,
-    outputs: Array,
-    inputs: Array,
-    columns: Columns,
-    out_png: Path,
-    **options: Any,
-) -> tuple[Path, ...]:
-    """:func:`histories` with its options as PNG and PDF, whose names are returned."""
-    return save(histories(times, outputs, inputs, columns, **options), out_png)
-
-
 def histories(
     times: Array,
     outputs: Array,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -10,21 +9,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from softgrasp.fem.columns import AXES, Array, Columns, hand_columns
-from softgrasp.study.pictures.style import COLUMN, CYCLE, HAND, STEPS, length_unit, paper_style, save
-
-
-def figure_traces(
-    times: Array,
-    outputs: Array,
-    columns: Columns,
-    q_s: Array,
-    out_png: Path,
-    *,
-    rigid: Array | None = None,
-    dimension: int | None = None,
-) -> tuple[Path, ...]:
-    """:func:`traces` as PNG and PDF, whose names are returned."""
-    return save(traces(times, outputs, columns, q_s, rigid=rigid, dimension=dimension), out_png)
+from softgrasp.study.pictures.style import COLUMN, CYCLE, HAND, STEPS, length_unit, paper_style
 
 
 def traces(

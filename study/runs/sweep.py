@@ -273,6 +273,8 @@ def sweep(scene: str | Path, values: Mapping[str, Sequence[float]], *, N: int | 
         SceneError: a key or a value is wrong, or there are more than 100000 points; a point that cannot be run has
             its ``reason`` instead of numbers.
     """
+    if single := next((key for key, each in values.items() if isinstance(each, str) or not np.iterable(each)), None):
+        raise SceneError(f"{shortened(single)} needs a list of values, as in {{'tissue.material.mu': [20, 500]}}")
     axes = tuple(SweepAxis(key, tuple(each)) for key, each in values.items())
     checked_count(axes)
     plan = Sweep(find_scene(scene), (), axes, N)

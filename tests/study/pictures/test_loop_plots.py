@@ -12,8 +12,9 @@ from PIL import Image
 
 from softgrasp.fem.columns import OutputColumn, farthest, hand_columns
 from softgrasp.study.pictures import loop as loop_plots
-from softgrasp.study.pictures.loop import figure_decay, figure_histories, still_to_come
+from softgrasp.study.pictures.loop import figure_decay, histories, still_to_come
 from softgrasp.study.pictures.shapes import move_steps
+from softgrasp.study.pictures.style import save
 
 pytestmark = pytest.mark.serial
 
@@ -38,14 +39,14 @@ Y = np.stack([2.0 * (1 - np.exp(-TIMES) * np.cos(9 * TIMES)), 1.0 - np.exp(-TIME
 U = np.stack([np.exp(-TIMES[:-1]), -3.0 * np.exp(-TIMES[:-1])], axis=1)
 
 
-def test_histories_show_the_numbers(tmp_path: Path, drawn: list[Any]) -> None:
-    files = figure_histories(
-        TIMES, Y, U, hand_columns(2, 2, "tip"), tmp_path / "h.png", target=[2.0, 1.0], limits=2.0, settle=10.0,
-        others={"N = 8": (Y, U)},
-    )  # fmt: skip
+def test_histories_show_the_numbers(tmp_path: Path) -> None:
+    figure = histories(
+        TIMES, Y, U, hand_columns(2, 2, "tip"), target=[2.0, 1.0], limits=2.0, settle=10.0, others={"N = 8": (Y, U)}
+    )
+    files = save(figure, tmp_path / "h.png")
     assert [f.suffix for f in files] == [".png"]
     assert np.asarray(Image.open(files[0])).std() > 1  # not one colour
-    top, force, distance = drawn[0].axes
+    top, force, distance = figure.axes
     assert np.array_equal(top.lines[0].get_ydata(), Y[:, 0])
     assert top.get_xlim() == (0.0, 10.0)
     assert distance.get_xlim() == (0.0, 30.0)
@@ -59,29 +60,20 @@ def test_histories_show_the_numbers(tmp_path: Path, drawn: list[Any]) -> None:
     assert texts == ["tip, x", "tip, y", "target"]
 
 
-def test_torques_get_axes_of_their_own(tmp_path: Path, drawn: list[Any]) -> None:
-    limits = [2.0, np.inf, 0.5]
-    figure_histories(
-        TIMES,
-        Y,
-        np.hstack([U, U[:, :1]]),
-        (OutputColumn("a"), OutputColumn("b")),
-        tmp_path / "t.png",
-        dimension=2,
-        limits=limits,
-    )
-    _, force, torque = drawn[0].axes
+def test_torques_get_axes_of_their_own() -> None:
+    loads, names = np.hstack([U, U[:, :1]]), (OutputColumn("a"), OutputColumn("b"))
+    figure = histories(TIMES, Y, loads, names, dimension=2, limits=[2.0, np.inf, 0.5])
+    _, force, torque = figure.axes
     assert {line.get_ydata()[0] for line in force.lines[2:]} == {-2.0, 2.0}
     assert {line.get_ydata()[0] for line in torque.lines[1:]} == {-0.5, 0.5}
-    labels = [ax.get_ylabel() for ax in drawn[0].axes]
-    assert labels == ["outputs [m]", "force [N]", "torque [N m]"]
+    assert [ax.get_ylabel() for ax in figure.axes] == ["outputs [m]", "force [N]", "torque [N m]"]
 
 
-def test_long_runs_are_thinned(tmp_path: Path, drawn: list[Any]) -> None:
+def test_long_runs_are_thinned() -> None:
     t = np.linspace(0, 300, 300_001)
     y = np.sin(t)[:, None]
-    figure_histories(t, y, y[:-1], (OutputColumn("y"),), tmp_path / "long.png", target=[0.0])
-    assert len(drawn[0].axes[0].lines[0].get_xdata()) <= 2 * loop_plots.MANY_POINTS
+    figure = histories(t, y, y[:-1], (OutputColumn("y"),), target=[0.0])
+    assert len(figure.axes[0].lines[0].get_xdata()) <= 2 * loop_plots.MANY_POINTS
 
 
 def test_what_is_still_to_come_never_rises() -> None:
@@ -117,12 +109,11 @@ def test_decay_of_few_poles(tmp_path: Path, poles: np.ndarray) -> None:
     assert figure_decay({"one": poles}, tmp_path / "one.png")[0].exists()
 
 
-def test_rotations_get_axes_of_their_own(tmp_path: Path, drawn: list[Any]) -> None:
+def test_rotations_get_axes_of_their_own() -> None:
     """Radians are not drawn as metres, and no two outputs of one panel share a colour."""
     names = (*hand_columns(3, 3, "tip"), *hand_columns(6, 3))
     y = np.outer(1 - np.exp(-TIMES), np.arange(1.0, 10.0))
-    figure_histories(TIMES, y, U, names, tmp_path / "r.png", target=np.arange(1.0, 10.0))
-    top, turn, force, _ = drawn[0].axes
+    top, turn, force, _ = histories(TIMES, y, U, names, target=np.arange(1.0, 10.0)).axes
     assert [ax.get_ylabel() for ax in (top, turn, force)] == ["outputs [m]", "rotation [rad]", "force [N]"]
     assert len({line.get_color() for line in top.lines[:6]}) == 6
     assert np.array_equal(turn.lines[0].get_ydata(), y[:, 6])

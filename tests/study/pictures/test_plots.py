@@ -27,7 +27,8 @@ from softgrasp.study.pictures.shapes import (
     speed_up,
     view_direction,
 )
-from softgrasp.study.pictures.traces import figure_traces
+from softgrasp.study.pictures.style import save
+from softgrasp.study.pictures.traces import traces
 from softgrasp.study.report.page import Section, write_report
 from tests.helpers.models import make_scene
 
@@ -132,18 +133,15 @@ def test_traces_draw_hand_and_output(tmp_path: Path) -> None:
     q = np.stack([t, t**2, 0.1 * t], axis=1)
     y = q[:, :2] + 0.01 * np.sin(9 * t)[:, None]
     names = (OutputColumn("tip", "x"), OutputColumn("tip", "y"))
-    (png,) = figure_traces(t, y, names, q[:, :2], tmp_path / "a.png")
-    (turned,) = figure_traces(t, y, names, q, tmp_path / "b.png", rigid=q[:, :2], dimension=2)
+    (png,) = save(traces(t, y, names, q[:, :2]), tmp_path / "a.png")
+    (turned,) = save(traces(t, y, names, q, rigid=q[:, :2], dimension=2), tmp_path / "b.png")
     assert len(colours(png)) > 30
     assert Image.open(turned).height > Image.open(png).height  # a panel for the angle
     both = np.hstack([y, q[:, :2]])  # the hand as an output too: drawn once, so the picture is the same
-    (again,) = figure_traces(
-        t, both, (*names, OutputColumn("hand", "x"), OutputColumn("hand", "y")), q[:, :2], tmp_path / "c.png"
-    )
+    hand = (OutputColumn("hand", "x"), OutputColumn("hand", "y"))
+    (again,) = save(traces(t, both, (*names, *hand), q[:, :2]), tmp_path / "c.png")
     assert ImageChops.difference(Image.open(again).convert("RGB"), Image.open(png).convert("RGB")).getbbox() is None
-    (alone,) = figure_traces(
-        t, q[:, :2], (OutputColumn("hand", "x"), OutputColumn("hand", "y")), q[:, :2], tmp_path / "d.png"
-    )
+    (alone,) = save(traces(t, q[:, :2], hand, q[:, :2]), tmp_path / "d.png")
     assert Image.open(alone).height < Image.open(png).height  # nothing moves relative to the hand
 
 
@@ -266,7 +264,7 @@ class Page(HTMLParser):
 
 def test_report_is_one_balanced_page(tmp_path: Path) -> None:
     t = np.linspace(0.0, 1.0, 9)
-    (png,) = figure_traces(t, t[:, None], (OutputColumn("tip", "x"),), t[:, None] * [1.0, 0.0], tmp_path / "a.png")
+    (png,) = save(traces(t, t[:, None], (OutputColumn("tip", "x"),), t[:, None] * [1.0, 0.0]), tmp_path / "a.png")
     table = Section(
         "Errors", "First.\n\nSecond <b>.", header=("N", "error", "ok"), rows=[(4, 1.25e-7, True), (6, None, False)]
     )
