@@ -239,7 +239,7 @@ def _rounds(horizon: Horizon, task: Task, normals: Array, level: float, sides: t
     for _ in range(ROUNDS):
         G, h, group = _rows(horizon, task, normals, c)
         c, slack, multipliers, active, more = _solve(G, h, group, hard, active, _price(horizon, task))
-        steps, slack = steps + more, slack.reshape(len(normals), -1)
+        steps, slack = steps + more, slack.reshape(len(normals), horizon.steps)
         costs.append(float(c @ c))
         plan = _judged(horizon, task, c, normals, slack, multipliers, level)
         plan = replace(plan, active=active, sides=sides)

@@ -17,9 +17,8 @@ from softgrasp.study.report.tables import Table, listed
 CAPTIONS = {
     "obstacle.png": "The boundary of the body on the full plant under the plan, and the way of its middle; grey and "
     "dashed: under the optimal feedback, which knows no obstacle, where it is deepest inside.",
-    "gaps.png": "Gap of the body to every obstacle on the full plant, where dashed the "
-    "clearance and the margin that the reduced plant keeps: of the margin the full plant may use all. Force and speed of "
-    "the hand with their limits.",
+    "gaps.png": "Gap of the body to every obstacle on the full plant. Dashed: clearance and margin, which the reduced "
+    "plant keeps; the full plant may use the margin up. Below: force and speed of the hand with their limits.",
 }
 GAPS = ("obstacle", "least gap [m]", "at [s]", "without the plan [m]")
 
