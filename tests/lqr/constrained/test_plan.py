@@ -138,7 +138,7 @@ def test_multiplier_is_what_a_metre_of_a_gap_costs() -> None:
     nearer = h.copy()
     nearer[np.argmax(found.multipliers)] -= 1e-6  # a micrometre less room
     more = nearest(G, nearer, plan.active).x
-    # one more round of half-planes and bends moves the multiplier by SETTLED or so, the quotient by 1e-6 times its slope
+    # one more round of half-planes and bends moves it by SETTLED or so, the quotient by 1e-6 times its slope
     assert abs(plan.multiplier / ((more @ more - found.x @ found.x) / 1e-6) - 1) < 1e-2
     pressed = make_plan(plant, replace(given, shapes=(), names=(), limits=Limits(np.full(2, 1.0))), 30)
     assert pressed.active
