@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import ResourceError
-from softgrasp.fem.model.memory import size_text
 from softgrasp.fem.obstacles.shapes import HalfSpace, Shape
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.resources import free_memory
+from softgrasp.fem.resources import free_memory, size_text
 from softgrasp.lqr.constrained.horizon import HeldPlant, Horizon
 from softgrasp.lqr.constrained.least_distance import InfeasibleError, nearest, nearest_soft
 from softgrasp.lqr.constrained.rows import Limits, bends, both_ends, broken, follow, gap_rows, limit_rows, tail_level
