@@ -35,6 +35,15 @@ def free_memory() -> int:
     return free
 
 
+def size_text(size: float) -> str:
+    """A number of bytes with its unit."""
+    for unit in ("byte", "KiB", "MiB", "GiB"):
+        if size < 1000:
+            return f"{size:.3g} {unit}"
+        size /= 1024
+    return f"{size:.3g} TiB"
+
+
 def _entry(table: Path, key: str) -> int:
     """The number behind a word in a table of lines "word number"; 0 without one."""
     try:

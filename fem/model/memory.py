@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import ResourceError, shortened
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.resources import free_memory
+from softgrasp.fem.resources import free_memory, size_text
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.costs import ITERATIVE, SolverName, Work
 
@@ -169,12 +169,3 @@ def _digits(value: float) -> int:
     whole = int(value)
     step: int = 10 ** max(len(str(whole)) - 2, 0)
     return whole // step * step
-
-
-def size_text(size: float) -> str:
-    """A number of bytes with its unit."""
-    for unit in ("byte", "KiB", "MiB", "GiB"):
-        if size < 1000:
-            return f"{size:.3g} {unit}"
-        size /= 1024
-    return f"{size:.3g} TiB"

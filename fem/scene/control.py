@@ -199,8 +199,8 @@ class Constraints(Section):
     )
     penalty: Literal["auto"] | Positive = Field(
         "auto",
-        description="cost of a metre inside an obstacle where no plan keeps all gaps [1/m]; auto: ten times the mean "
-        "cost of a metre of the way",
+        description="cost of a metre inside an obstacle where no plan keeps all gaps [1/m]; auto: twenty times the "
+        "mean cost of a metre of the way",
     )
 
     @model_validator(mode="after")
