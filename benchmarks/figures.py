@@ -65,7 +65,7 @@ class Number:
 class Figure:
     """A figure of one or two numbers."""
 
-    text: str  # what it says
+    text: str  # meaning of the numbers, with {} for each
     numbers: tuple[Number, ...]
 
 
@@ -73,10 +73,10 @@ class Figure:
 class Command:
     """A command and the figures that it prints."""
 
-    name: str  # as --only takes it
+    name: str  # argument of --only
     line: str  # as a user types it, without --out
     figures: tuple[Figure, ...]
-    file: str = "result.json"  # that holds the numbers
+    file: str = "result.json"  # file of the numbers, relative to the folder of results
 
     def arguments(self, out: Path) -> list[str]:
         """For a process of this Python."""

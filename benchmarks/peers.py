@@ -79,7 +79,7 @@ class PlainCholesky(BareSolve):
         self.r, self.w = S.createVecs()
         self.r.set(1.0)
         self.solve = self.ksp.getPC().getFactorMatrix().solve
-        S.destroy()  # the ksp holds it
+        S.destroy()  # the ksp owns it
 
 
 class ScipyLoop:

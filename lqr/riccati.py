@@ -151,7 +151,7 @@ def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) ->
 
     Args:
         modes: number of modes in the model.
-        candidates: lowest modes they are taken from; modes that inputs do not reach or outputs do not see are skipped.
+        candidates: lowest modes they are chosen from; modes that inputs do not reach or outputs do not see are skipped.
 
     Returns:
         A solution of rank up to 2 n_s + 2 modes. ``residual`` is the true one of the whole plant: it is large when

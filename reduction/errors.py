@@ -184,7 +184,7 @@ class ModelComparison:
     def shown(self, view: View, model: ReducedModel, small: EnergySystem) -> Array:
         """R of :meth:`Span.inside` for the views of a model, kept until the next model. Collective.
 
-        Raises ModelError: the model shows more than the largest.
+        Raises ModelError: the model is larger than that.
         """
         known, R = self._shown.get(view, (None, np.zeros((0, 0))))
         if known is not model:
@@ -213,7 +213,7 @@ class ModelComparison:
     def projection_error(self, view: View, model: ReducedModel, small: EnergySystem) -> float:
         """min_Y |X - V Y|_F / |X|_F over all states V y, with the hand q_s = S_q y and v_s = S_v y. Collective.
 
-        Raises ModelError: the model shows more than the largest.
+        Raises ModelError: the model is larger than that.
         """
         return self.span(view).projection_error(self.shown(view, model, small) @ with_hand(small))
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class ReducedModel(Shown):
-    """E x' = A x + B u + F g for all lambda, mu, rho of every layer: a new parameter costs no full-order work.
+    """E x' = A x + B u + F g for all lambda, mu, rho of every layer: a new parameter needs no full-order work.
 
     The matrices are sums over the layers, A = A_0 + sum_l lambda_l A_lambda,l + mu_l A_mu,l and so on, which
     :meth:`at` assembles; a run needs the :class:`EnergySystem` that it returns.
@@ -130,7 +130,7 @@ class ReducedModel(Shown):
             # the common factor enters squared at most: more than rounding apart is another mass distribution
             if max(ratios) - min(ratios) > 1e-12 * scale:
                 raise ModelError(
-                    "a canonical model holds M_ee^-1 and takes densities that all change by one factor; "
+                    "a canonical model contains M_ee^-1 and accepts densities that all change by one factor;  "
                     "project again, or use a (q, v) model"
                 )
         g = self.gravity if gravity is None else np.asarray(gravity, dtype=float)

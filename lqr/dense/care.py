@@ -187,7 +187,7 @@ def block_eigenvalues(T: Array) -> Complex:
 def check_axis(hamiltonian: Array, values: Complex, stable: int) -> None:
     """No eigenvalue of the Hamiltonian matrix is on the imaginary axis to working precision.
 
-    A double eigenvalue on the axis splits by sqrt(eps), so a small real part alone says nothing: what counts is the
+    A double eigenvalue on the axis splits by sqrt(eps), so a small real part alone proves nothing: what counts is the
     distance min sigma(H - i omega I) to a matrix with an eigenvalue there.
 
     Raises ControlError: the distance is of the order of rounding.
@@ -281,7 +281,7 @@ def unreached(A: Array, B: Array) -> list[complex]:
 
 
 def _explain(A: Array, B: Array, C: Array) -> str | None:
-    """The reason, when one of the two rank tests knows it."""
+    """The reason, when one of the two rank tests finds it."""
     missed = unreached(A, B)
     if missed:
         return (

@@ -64,11 +64,11 @@ class Actuation:
 
 
 class ImplicitInput:
-    """Solve u = clip(u_0 + H u) for the input that holds within a step.
+    """Solve u = clip(u_0 + H u) for the input that is constant within a step.
 
     H is what one step turns a unit of input into, seen through the gain at the midpoint (SMW form of the implicit
     feedback). An input at its limit is fixed there, the others stay implicit: a linear complementarity problem between
-    bounds for a few unknowns, whose solution is unique where I - H is a P-matrix (feedback that takes energy out).
+    bounds for a few unknowns, whose solution is unique where I - H is a P-matrix (feedback that dissipates energy).
     Block pivoting [JP94]: all wrong inputs change sides together, after a few rounds only the last one, which ends.
     """
 

@@ -64,7 +64,7 @@ def plant_modes(plant: Plant, k: int) -> tuple[Array, Array]:
     kept = system.kept.get("floating modes")
     if kept is None or kept[0] != key or len(kept[1]) < k:
         most = max(k, min(MORE_MODES, system.layout.n_e))  # the certificate requests them after the start of a solver
-        kept = key, *_floating(plant, most), system.K_ee, system.M_ee  # no other matrix can take their handles
+        kept = key, *_floating(plant, most), system.K_ee, system.M_ee  # no other matrix can get their handles
         if most * system.layout.n_e <= KEPT_ENTRIES:
             system.kept["floating modes"] = kept
     return kept[1][:k].copy(), kept[2][:, :k].copy(order="F")
@@ -115,7 +115,7 @@ def solve_small(plant: Plant, space: WeightedSystem, guess: Array | None = None)
 def _few_modes(m: WeightedSystem, r: int) -> Array | None:
     """X of the lowest of r modes alone, zero for the others; None where all are few.
 
-    With the two Newton steps that follow it takes a third of the time of one Schur form for all modes.
+    With the two Newton steps that follow it needs a third of the time of one Schur form for all modes.
     """
     N, k = m.N, FEW_MODES
     if r < 2 * k:

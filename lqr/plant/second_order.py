@@ -26,7 +26,7 @@ def second_order(
     Assumptions: M and K symmetric positive definite, D symmetric positive semidefinite, all distributed by the same
     rows. The copies that are kept share one sparsity pattern. NewtonADI, RADI, StructuredGalerkin, DenseRiccati,
     modal_lqr and the diagnosis apply; targets, closed loops and the certified abscissa belong to a hand. The start of
-    NewtonADI takes the lowest modes: where others matter more, RADI is the faster one. Collective.
+    NewtonADI starts from the lowest modes: where others matter more, RADI is the faster one. Collective.
 
     Args:
         matrices: mass M, damping D and stiffness K, AIJ matrices (n_e, n_e).

@@ -212,11 +212,11 @@ class GainCheck:
     def stability(self, gain: Gain) -> LoopQuality:
         """Abscissa and sampled radius of any gain, without its cost. Collective.
 
-        Plants of no more modes than ``loop`` keeps take all. Larger ones take the abscissa from
-        :func:`softgrasp.lqr.spectrum.certificate.abscissa`; where the certificate fails, all modes are taken up to
+        Plants of no more modes than ``loop`` keeps use all. Larger ones have the abscissa from
+        :func:`softgrasp.lqr.spectrum.certificate.abscissa`; where the certificate fails, all modes are used up to
         :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`.
 
-        Raises SolverError: no eigenvalue converges, and there are too many modes to take all.
+        Raises SolverError: no eigenvalue converges, and there are too many modes to use all.
         """
         K = gain.block
         if self.loop.complete:

@@ -31,7 +31,7 @@ GROUP = "certificate"
 
 
 def save_certified(model: CertifiedModel, path: str | Path) -> None:
-    """Write a certified model to one HDF5 file, atomically. Collective when it holds a reconstruction.
+    """Write a certified model to one HDF5 file, atomically. Collective when it has a reconstruction.
 
     Raises:
         OSError: the file cannot be written.

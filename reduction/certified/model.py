@@ -217,7 +217,7 @@ class CertifiedModel(Shown):
     def _given(self, drive: Drive | None) -> Drive:
         drive = self.drive if drive is None else drive
         if drive is None:
-            raise ModelError("give the motion of the hand, or the force on it; the model holds none", self.fine.name)
+            raise ModelError("give the motion of the hand, or the force on it; the model has none", self.fine.name)
         return drive
 
     def _each(

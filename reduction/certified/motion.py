@@ -126,7 +126,7 @@ def padded(x: Array, N: int, n_s: int) -> Array:
 
 
 def known_hand(model: ReducedModel, drive: Drive, gravity: Array) -> tuple[Array, Array] | None:
-    """Tables of the hand, which one-way coupling knows beforehand; None two-way under a force.
+    """Tables of the hand, which are known beforehand with one-way coupling; None two-way under a force.
 
     Raises:
         ModelError: the tables do not fit.

@@ -199,7 +199,7 @@ class Orthonormal:
         return np.asarray(self.comm.bcast(T))
 
     def destroy(self) -> None:
-        """Free what PETSc holds. Collective."""
+        """Free the PETSc objects. Collective."""
         if self.product is None:
             self.solver.destroy()
 

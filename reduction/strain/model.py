@@ -27,7 +27,7 @@ from softgrasp.reduction.system import ModelError, Outputs
 
 TOLERANCE = 1e-10  # of a step's residual: the drift of a model's own energy stays near it
 SLACK = 1e-9  # of the edges of the box: rounding of the user's own arithmetic
-# of accelerations: those of a run are means over its steps h, off the peak of a motion by up to (w h)^2 / 6, hence 1 %
+# of accelerations: those of a run are means over its steps h, up to (w h)^2 / 6 below the peak of a motion, hence 1 %
 # from 25 steps a period on; another step of the same motion comes closer to the peak than the training did
 LOAD_SLACK = 1e-2
 REACH, SMALL = 2.0, 0.02  # times what the training runs reached, of coordinates above this share of the largest
