@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from softgrasp.fem.mesh.singular import Ends, expected_order
     from softgrasp.fem.mesh.tissue_mesh import TissueMesh
     from softgrasp.fem.model.build import MeshEstimate, Model, Stopwatch, build
-    from softgrasp.fem.model.memory import free_bytes, size_text
+    from softgrasp.fem.model.memory import free_bytes
     from softgrasp.fem.model.outputs import make_outputs
     from softgrasp.fem.model.refined import scene_ends
     from softgrasp.fem.model.scales import SMALL_STRAIN, rigid_inertia
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from softgrasp.fem.owned import note, remove_own
     from softgrasp.fem.petsc import PETSc, on_root, total
     from softgrasp.fem.reduced import ReducedSystem
-    from softgrasp.fem.resources import free_memory
+    from softgrasp.fem.resources import free_memory, size_text
     from softgrasp.fem.run.checkpoint import check_ranks
     from softgrasp.fem.run.forecast import Forecast, forecasts, told
     from softgrasp.fem.run.frames import FRAMES, frame_count, frame_steps

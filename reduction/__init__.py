@@ -1,4 +1,4 @@
-"""Reduced bases and reduced models; imports fem only, knows matrices and vectors but no DOLFINx."""
+"""Reduced bases and reduced models; imports fem only, of matrices and vectors, without DOLFINx."""
 
 from typing import TYPE_CHECKING
 

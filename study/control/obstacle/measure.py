@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem import Stopwatch
+from softgrasp.fem import Stopwatch, on_root
 from softgrasp.lqr import Design, Notify, Plan, plan_control, quadratic_program
 from softgrasp.lqr.constrained.least_distance import nearest
 from softgrasp.study.control.obstacle.result import PlannedStudy
@@ -17,7 +17,7 @@ SOLUTIONS = 10  # of the quadratic program, behind its times
 def planned_study(design: Design, watch: Stopwatch, notify: Notify) -> PlannedStudy:
     """Plan, runs and times. Collective. Raises ControlError, SolverError: see :func:`plan_control`."""
     planned = plan_control(design, watch, notify)
-    rows, cold, warm = times(planned.plan)
+    rows, cold, warm = on_root(design.problem.layout.comm, lambda: times(planned.plan))
     return PlannedStudy(planned, design.gain_check.optimal, rows, cold, warm)
 
 
