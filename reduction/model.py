@@ -101,7 +101,10 @@ class ReducedModel(Shown):
         Raises:
             ModelError: materials that the parts cannot represent.
         """
-        p = self.parameters(self.materials if materials is None else materials, gravity)
+        return self.assemble(self.parameters(self.materials if materials is None else materials, gravity))
+
+    def assemble(self, p: Parameters) -> EnergySystem:
+        """The sums at parameters that need be no material, such as one constant alone. Online; not collective."""
         if self.coordinates == "qv":
             return galerkin_system(self.name, self.parts, p, self.outputs, self.structure == "second_order")
         return canonical_system(self.name, self.parts, p, self.outputs, self.fixed_solid, self.frame == "absolute")
