@@ -21,8 +21,8 @@ KINDS = {(2, 1): 5, (2, 2): 22, (2, 3): 69, (3, 1): 10, (3, 2): 24, (3, 3): 71} 
 class SeriesWriter:
     """Fields against time in ``NAME.pvd``, with a file an instant in the folder ``NAME``.
 
-    Each has at the nodes ``displacement`` [m], ``velocity`` [m/s], ``held`` (1 on the contact zone) and with obstacles
-    ``contact_traction`` [Pa], their force over area in the step that ends there; in the cells ``strain`` [1], ``stress``
+    Each has at the nodes ``displacement`` [m], ``velocity`` [m/s], ``held`` (1 on the contact zone), with obstacles
+    ``contact_traction`` [Pa], their force over area in the last step; in the cells ``strain`` [1], ``stress``
     and ``von_mises`` [Pa] and ``layer``; and ``hand`` [m, rad], the hand's displacement. Cells keep the order of the
     elements.
 
