@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from softgrasp.fem.model.outputs import make_outputs
     from softgrasp.fem.model.refined import scene_ends
     from softgrasp.fem.model.scales import SMALL_STRAIN, rigid_inertia
-    from softgrasp.fem.obstacles import Ball, HalfSpace, Polytope, Shape
+    from softgrasp.fem.obstacles import Ball, HalfSpace, Obstacle, Polytope, Shape
     from softgrasp.fem.owned import note, remove_own
     from softgrasp.fem.petsc import PETSc, on_root, total
     from softgrasp.fem.reduced import ReducedSystem
