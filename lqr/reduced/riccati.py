@@ -286,11 +286,11 @@ class GainCheck:
             reduced = reduce_riccati(self.problem, basis)
         except ControlError as error:
             return GainReport(basis.name, basis.N, reason=str(error))
-        error = factor_error(self.problem, self.Z_absolute, reduced.basis, reduced.P_N) if error_P else NAN
+        distance = factor_error(self.problem, self.Z_absolute, reduced.basis, reduced.P_N) if error_P else NAN
         error_K, gain = gain_error(self.problem, self.solution.gain, reduced.gain), reduced.gain  # noqa: N806
         known = self._of_poles(gain.block, self.loop)
         return GainReport(
-            basis.name, basis.N, error, matrices=reduced.matrices, gain=gain, error_K=error_K,
+            basis.name, basis.N, distance, matrices=reduced.matrices, gain=gain, error_K=error_K,
             abscissa_full=known.abscissa, certified=known.certified, sampled=known.sampled,
             examined=self.loop.complete,
         )  # fmt: skip
