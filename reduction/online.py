@@ -75,7 +75,7 @@ def run(
 ) -> ReducedTrajectory:
     """Midpoint steps E (x_1 - x_0) / dt = A (x_0 + x_1) / 2 + B u + f of a small model. Online; not collective.
 
-    They equal the full model's steps [HLW06], so that structure and errors carry over; many are taken in one product.
+    They equal the full model's steps [HLW06], so that structure and errors carry over; many steps are one product.
 
     Args:
         model: small model, or a propagator made beforehand.

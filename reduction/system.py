@@ -16,7 +16,7 @@ from softgrasp.reduction.spectrum import Spectrum, spectrum
 
 
 class ModelError(ReductionError):
-    """A reduced model cannot be made, or is asked for what it does not hold."""
+    """A reduced model cannot be made, or lacks what a call needs."""
 
 
 class UnstableModelError(SoftgraspError):
@@ -100,7 +100,7 @@ class EnergySystem(ReducedSystem):
             raise ModelError("the reduced matrices are not finite; check basis and materials", self.name)
         if singular(self.E):
             raise ModelError(
-                "the reduced E is singular; its basis vectors are linearly dependent, take fewer", self.name
+                "the reduced E is singular; its basis vectors are linearly dependent, use fewer", self.name
             )
 
     @property
@@ -138,6 +138,6 @@ class EnergySystem(ReducedSystem):
         if self.f.any():
             A = self.A[k:, k:]
             if singular(A):  # as with more displacements than velocities in the basis
-                raise ModelError("the basis has no single equilibrium under gravity; take another N", self.name)
+                raise ModelError("the basis has no single equilibrium under gravity; use another N", self.name)
             x[k:] = -np.linalg.solve(A, self.f[k:])
         return x

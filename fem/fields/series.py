@@ -21,7 +21,7 @@ KINDS = {(2, 1): 5, (2, 2): 22, (2, 3): 69, (3, 1): 10, (3, 2): 24, (3, 3): 71} 
 class SeriesWriter:
     """Fields against time in ``NAME.pvd``, with a file an instant in the folder ``NAME``.
 
-    Each holds at the nodes ``displacement`` [m], ``velocity`` [m/s] and ``held`` (1 where the hand holds the tissue);
+    Each has at the nodes ``displacement`` [m], ``velocity`` [m/s] and ``held`` (1 on the contact zone);
     in the cells ``strain`` [1], ``stress`` and ``von_mises`` [Pa] and ``layer``; and ``hand`` [m, rad], the hand's
     displacement. Cells keep the order of the elements.
 
@@ -73,7 +73,7 @@ class SeriesWriter:
         points, cells = self._fields(z, v, q_s, v_s)
         whole = [Field("TimeValue", "s", np.array([t])), Field("hand", "m", np.asarray(q_s, dtype=np.float64))]
         fields = [*points, *cells, *(field for part in self.grid.fields().values() for field in part)]
-        needed = self.comm.reduce(sum(field.values.nbytes for field in fields)) or 0  # one file, so rank 0 asks for all
+        needed = self.comm.reduce(sum(field.values.nbytes for field in fields)) or 0  # one file, by rank 0
         if self.written == 0:
             on_root(self.comm, self._begin)
         path = self.folder / f"{self.written:06}.vtu"

@@ -185,7 +185,7 @@ class Controller(Shown):
             about = {key: meta[key] for key in ("period", "scene_hash", "layout_hash", "about")}
             return cls(arrays["K"], arrays["x_bar"], arrays["u_bar"], plant, limits=arrays.get("limits"), **about)
         except KeyError as error:
-            raise ControlError(f"{path} holds no controller ({error} is missing); save it again") from error
+            raise ControlError(f"{path} has no controller ({error} is missing); save it again") from error
 
 
 def _tissue_step(plant: ReducedSystem, period: float) -> tuple[Array, Array, Array | None, Array]:
@@ -234,7 +234,7 @@ def load_gain(path: Path, layout: BlockLayout, scene_hash: str | None = None) ->
                 hand = (arrays["K_s"], arrays["q_s"], arrays["v_s"])
                 pieces = [(*hand, np.array(rows[a:b])) for a, b in ranges]
             except (KeyError, IndexError, ValueError) as error:
-                raise ControlError(f"{path} holds no full-order gain ({error}); save it again") from error
+                raise ControlError(f"{path} has no full-order gain ({error}); save it again") from error
     K_s, q_s, v_s, rows = layout.comm.scatter(pieces)
     K_z, K_v = (np.asfortranarray(part) for part in np.split(rows[:, :-2], 2, axis=1))
     return Gain(K_s, K_z, K_v), PlantState(q_s, v_s, rows[:, -2].copy(), rows[:, -1].copy())

@@ -132,7 +132,7 @@ def translation_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> fl
 def velocity_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> float | None:
     """||(K x_T)'R(K v_T) - x_T'E'XE x_T|| / ||x_T'E'XE x_T||.
 
-    None when the damping drags against space: the identity does not hold then.
+    None when the damping drags against space: the identity is not valid then.
     """
     if problem.system.damping.in_space and problem.system.damping.alpha > 0:
         return None

@@ -27,7 +27,7 @@ from softgrasp.reduction.system import ModelError, Outputs
 
 TOLERANCE = 1e-10  # of a step's residual: the drift of a model's own energy stays near it
 SLACK = 1e-9  # of the edges of the box: rounding of the user's own arithmetic
-# of accelerations: those of a run are means over its steps h, off the peak of a motion by up to (w h)^2 / 6, hence 1 %
+# of accelerations: those of a run are means over its steps h, up to (w h)^2 / 6 below the peak of a motion, hence 1 %
 # from 25 steps a period on; another step of the same motion comes closer to the peak than the training did
 LOAD_SLACK = 1e-2
 REACH, SMALL = 2.0, 0.02  # times what the training runs reached, of coordinates above this share of the largest
@@ -71,7 +71,7 @@ class TrainingDomain:
         i = int(np.argmax(ratio))
         if ratio[i] <= REACH:
             return ""
-        return f"the run takes coordinate {i + 1} to {ratio[i]:.2g} times what the training runs reached"
+        return f"the run moves coordinate {i + 1} to {ratio[i]:.2g} times what the training runs reached"
 
 
 @dataclass(frozen=True, repr=False)
@@ -185,7 +185,7 @@ class ReducedStrainSystem(Shown):
         model, dt = self.model, self.problem.dt
         q, v = checked_hand(hand, model.G.shape[1])
         if not (np.isfinite(q).all() and np.isfinite(v).all()):
-            raise ModelError("the hand's tables hold numbers that are not finite")
+            raise ModelError("the hand's tables contain numbers that are not finite")
         c = np.diff(v, axis=0) / dt - self.gravity
         untrained = model.box.refuse(self.materials) or model.box.refuse_load(c)
         refuse(untrained, self.outside)
@@ -233,13 +233,13 @@ class StrainModel(Shown):
     alpha: float = 0.0  # mass-proportional damping [1/s]
     in_space: bool = False  # alpha drags the rigid motion too
     gravity: Array | None = None  # acceleration of free fall (n_s,), or None
-    cubature_tolerance: float = 0.0  # largest |G x - b| / |b| of the cubature weights x that was asked for [1]
+    cubature_tolerance: float = 0.0  # largest |G x - b| / |b| of the cubature weights x that was allowed [1]
     cubature_residual: float = 0.0  # |G x - b| / |b| that was reached; 0 where no cell is left out [1]
     error_galerkin: float = 0.0  # relative error in z of the model with all cells, over the training runs [1]
     layout: BlockLayout | None = None  # rows of the mesh that Phi has, or None
     Phi: Array | None = None  # reconstruction z = Phi a, local rows (n_local, k), or None
     scene_hash: str = ""  # of the scene it was made for
-    origin: dict[str, Any] = field(default_factory=dict)  # of `reduction.origin`, what that scene says of a run; or {}
+    origin: dict[str, Any] = field(default_factory=dict)  # keys of the scene, see `reduction.origin`; {} for none
     finer: Finer | None = None  # space in which its answers are checked; None leaves them without an estimate
     seconds: dict[str, float] = field(default_factory=dict)  # offline time by stage [s]
 
@@ -275,8 +275,8 @@ class StrainModel(Shown):
 
         Args:
             dt: step [s].
-            materials: one a layer; None takes those of the projection.
-            gravity: acceleration of free fall (n_s,) [m/s^2]; None takes that of the scene.
+            materials: one a layer; None: those of the projection.
+            gravity: acceleration of free fall (n_s,) [m/s^2]; None: that of the scene.
             outside: allow what the model was not trained on.
 
         Raises:
@@ -300,5 +300,5 @@ class StrainModel(Shown):
         Raises ModelError: the model was loaded without its reconstruction.
         """
         if self.Phi is None:
-            raise ModelError("the model holds no basis on the mesh; load it with the layout of its mesh")
+            raise ModelError("the model has no basis on the mesh; load it with the layout of its mesh")
         return np.asarray(self.Phi @ a.T)
