@@ -135,10 +135,14 @@ def march_together(steps: Sequence[MidpointSteps], inputs: Array, start: Array) 
 class StateSpace(Shown):
     """E x' = A x + B u, y = C x, dense, of dimension N."""
 
-    E: Array  # matrix of the rates, regular, (N, N)
-    A: Array  # matrix of the states, (N, N)
-    B: Array  # matrix of the inputs, (N, m); of force and torque on the hand m = n_s
-    C: Array  # matrix of the outputs, (p, N)
+    E: Array
+    """Matrix of the rates, regular, (N, N)."""
+    A: Array
+    """Matrix of the states, (N, N)."""
+    B: Array
+    """Matrix of the inputs, (N, m); of force and torque on the hand m = n_s."""
+    C: Array
+    """Matrix of the outputs, (p, N)."""
 
     @property
     def N(self) -> int:
@@ -160,10 +164,14 @@ class ReducedSystem(StateSpace):
     (('force_x [N]', 'force_y [N]'), (1, 2, 2))
     """
 
-    f: Array  # constant load of gravity, (N,)
-    S_q: Array  # displacement of the hand, (n_s, N)
-    S_v: Array  # velocity of the hand, (n_s, N)
-    names: tuple[str, ...] = ()  # names of the outputs, "tip_x"; y_1.. where their number does not fit
+    f: Array
+    """Constant load of gravity, (N,)."""
+    S_q: Array
+    """Displacement of the hand, (n_s, N)."""
+    S_v: Array
+    """Velocity of the hand, (n_s, N)."""
+    names: tuple[str, ...] = ()
+    """Names of the outputs, "tip_x"; y_1.. where their number does not fit."""
 
     def card(self) -> Card:
         """Dimension, inputs and outputs."""

@@ -40,10 +40,14 @@ VIEWS: tuple[View, ...] = get_args(View)
 class ModelErrors:
     """Relative errors of a reduced run against snapshots of the full one, dimensionless."""
 
-    error: float  # |X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e] in absolute coordinates: the paper's error [SBRH21]
-    error_canonical: float  # |X - X_r|_F / |X|_F of X = [q_s, p_s, q_e, p_e], from which canonical bases are built
-    error_deformation: float  # |X - X_r|_F / |X|_F of X = [z, v_z], relative to the rigid motion of the hand
-    error_energy: float  # max_t |H_r - H| / max_t H of the tissue's energy relative to the hand
+    error: float
+    """|X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e] in absolute coordinates: the paper's error [SBRH21]."""
+    error_canonical: float
+    """|X - X_r|_F / |X|_F of X = [q_s, p_s, q_e, p_e], from which canonical bases are built."""
+    error_deformation: float
+    """|X - X_r|_F / |X|_F of X = [z, v_z], relative to the rigid motion of the hand."""
+    error_energy: float
+    """Error max_t |H_r - H| / max_t H of the tissue's energy relative to the hand."""
 
 
 def full_energy(system: BlockSystem, Z: Array) -> Array:

@@ -78,12 +78,18 @@ class TrainingDomain:
 class StrainRun(ReducedTrajectory):
     """A reduced run at finite strain, x = [q_s, v_s, a, a']."""
 
-    small: ReducedStrainSystem = field(repr=False)  # what was stepped
-    acceleration: Array = field(repr=False)  # a_s - g [+ alpha v_s] at the midpoints, (steps, n_s) [m/s^2, rad/s^2]
-    evaluations: float  # of the force, in the mean of a step
-    restarts: int  # fresh tangents
-    engine: str  # "C" or "NumPy"
-    untrained: str = ""  # why the run lies outside of what the model was trained on; empty inside
+    small: ReducedStrainSystem = field(repr=False)
+    """System at the parameter and time step of the run."""
+    acceleration: Array = field(repr=False)
+    """Apparent acceleration a_s - g [+ alpha v_s] of the hand at the midpoints [m/s^2, rad/s^2], (steps, n_s)."""
+    evaluations: float
+    """Mean number of evaluations of the force in a step."""
+    restarts: int
+    """Number of tangents made anew in the run."""
+    engine: str
+    """Name of the stepper, "C" or "NumPy"."""
+    untrained: str = ""
+    """Reason why the run lies outside of the training domain, a sentence; empty inside."""
 
     @property
     def a(self) -> Array:
@@ -135,11 +141,16 @@ def coordinates(run: ReducedTrajectory) -> tuple[Array, Array]:
 class ReducedStrainSystem(Shown):
     """A model at one parameter and one time step, everything made that a run needs."""
 
-    model: StrainModel  # it comes from
-    problem: StrainProblem  # potential, damping, tangent at rest, step
-    materials: tuple[LayerMaterial, ...]  # one a layer
-    gravity: Array  # acceleration of free fall, (n_s,)
-    outside: bool = False  # runs outside of the training box are allowed
+    model: StrainModel
+    """Reduced model that it was made from."""
+    problem: StrainProblem
+    """Potential, damping, tangent at rest and time step."""
+    materials: tuple[LayerMaterial, ...]
+    """Materials of the run, one a layer."""
+    gravity: Array
+    """Acceleration of free fall [m/s^2], (n_s,)."""
+    outside: bool = False
+    """Whether runs outside of the training domain are allowed."""
 
     @cached_property
     def finer(self) -> StrainProblem | None:
@@ -222,26 +233,46 @@ def refuse(reason: str, outside: bool) -> None:
 class StrainModel(Shown):
     """Reduced model of tissue at finite strain for all lambda and mu of its training box."""
 
-    cells: Cells  # sampled cells, in reduced coordinates
-    K_mu: Array  # linear stiffness of every layer at mu = 1 Pa, lambda = 0, (layers, k, k)
-    K_lambda: Array  # linear stiffness of every layer at lambda = 1 Pa, mu = 0, (layers, k, k)
-    G: Array  # Phi' G at the densities of the projection, (k, n_s)
-    materials: tuple[LayerMaterial, ...]  # of the projection, one a layer
-    outputs: Outputs  # y = C_z a + C_s q_s
-    box: TrainingDomain  # what it was trained on
-    cells_full: int  # number of cells of the body
-    alpha: float = 0.0  # mass-proportional damping [1/s]
-    in_space: bool = False  # alpha drags the rigid motion too
-    gravity: Array | None = None  # acceleration of free fall (n_s,), or None
-    cubature_tolerance: float = 0.0  # largest |G x - b| / |b| of the cubature weights x that was allowed [1]
-    cubature_residual: float = 0.0  # |G x - b| / |b| that was reached; 0 where no cell is left out [1]
-    error_galerkin: float = 0.0  # relative error in z of the model with all cells, over the training runs [1]
-    layout: BlockLayout | None = None  # rows of the mesh that Phi has, or None
-    Phi: Array | None = None  # reconstruction z = Phi a, local rows (n_local, k), or None
-    scene_hash: str = ""  # of the scene it was made for
-    origin: dict[str, Any] = field(default_factory=dict)  # keys of the scene, see `reduction.origin`; {} for none
-    finer: Finer | None = None  # space in which its answers are checked; None leaves them without an estimate
-    seconds: dict[str, float] = field(default_factory=dict)  # offline time by stage [s]
+    cells: Cells
+    """Sampled cells with their weights, in reduced coordinates."""
+    K_mu: Array
+    """Linear stiffness of every layer at mu = 1 Pa, lambda = 0, (layers, k, k)."""
+    K_lambda: Array
+    """Linear stiffness of every layer at lambda = 1 Pa, mu = 0, (layers, k, k)."""
+    G: Array
+    """Phi' G at the densities of the projection, (k, n_s)."""
+    materials: tuple[LayerMaterial, ...]
+    """Materials of the projection, one a layer."""
+    outputs: Outputs
+    """Names and matrices of the outputs y = C_z a + C_s q_s."""
+    box: TrainingDomain
+    """Materials, coordinates and accelerations of the training."""
+    cells_full: int
+    """Number of cells of the body."""
+    alpha: float = 0.0
+    """Mass-proportional damping [1/s]."""
+    in_space: bool = False
+    """Whether alpha damps the rigid motion too."""
+    gravity: Array | None = None
+    """Acceleration of free fall [m/s^2], (n_s,), or None."""
+    cubature_tolerance: float = 0.0
+    """Largest allowed |G x - b| / |b| of the cubature weights x [1]."""
+    cubature_residual: float = 0.0
+    """Reached |G x - b| / |b| [1]; 0 where no cell is left out."""
+    error_galerkin: float = 0.0
+    """Relative error in z of the model with all cells, over the training runs [1]."""
+    layout: BlockLayout | None = None
+    """Distribution of the mesh's rows in Phi, or None."""
+    Phi: Array | None = None
+    """Reconstruction z = Phi a, local rows (n_local, k), or None."""
+    scene_hash: str = ""
+    """Hash of the scene it was made for."""
+    origin: dict[str, Any] = field(default_factory=dict)
+    """Keys of the scene that decide on a run, see `reduction.origin`; {} for none."""
+    finer: Finer | None = None
+    """Larger space in which the error of a run is estimated; None: without an estimate."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Offline time by stage [s]."""
 
     def card(self) -> Card:
         """Dimension, cells, materials and outputs."""

@@ -59,9 +59,12 @@ TAUS = (1e-4, 3e-2)  # least and largest tau chosen from the error of the model 
 class StrainErrors:
     """Relative errors over the snapshots of one full run, or of several, dimensionless."""
 
-    z: float  # |Z - Phi A|_F / |Z|_F of the deformation
-    v: float  # |V - Phi A'|_M / |V|_M of its velocity
-    energy_norm: float  # of (z, v) in (z' K_ee z + v' M_ee v)^(1/2), K_ee at rest
+    z: float
+    """Error |Z - Phi A|_F / |Z|_F of the deformation."""
+    v: float
+    """Error |V - Phi A'|_M / |V|_M of its velocity."""
+    energy_norm: float
+    """Error of (z, v) in the norm (z' K_ee z + v' M_ee v)^(1/2), K_ee at rest."""
 
 
 @dataclass(frozen=True)
