@@ -100,7 +100,7 @@ class Stars:
         with petsc_options(ksp.getOptionsPrefix(), SMOOTHER | (FACTORED if self.factored else ITERATED)):
             ksp.setFromOptions()
             ksp.setUp()
-            if pc.getType() == "mg":
+            if coarse is not None and pc.getType() == "mg":  # the options may have changed it
                 coarse.setUp()
 
     @property
