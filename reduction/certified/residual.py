@@ -22,7 +22,7 @@ from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.material import LayerMaterial
-from softgrasp.fem.petsc import Array, PETSc, times_columns, total
+from softgrasp.fem.petsc import Array, PETSc, from_options, times_columns, total
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from softgrasp.fem.system import BlockSystem
@@ -145,7 +145,7 @@ class Orthonormal:
 
     Args:
         system: system of the tissue, for the distribution of the rows and the choice of the solver.
-        W: matrix of the norm, symmetric positive definite; None stands for W^-1 = ``product``.
+        W: matrix of the norm, symmetric positive definite; None: W^-1 = ``product``.
         product: matrix W^-1 itself, which needs no solver; None where W is given.
     """
 
@@ -199,7 +199,7 @@ class Orthonormal:
         return np.asarray(self.comm.bcast(T))
 
     def destroy(self) -> None:
-        """Free what PETSc holds. Collective."""
+        """Free the PETSc objects. Collective."""
         if self.product is None:
             self.solver.destroy()
 
@@ -276,6 +276,7 @@ def highest_frequency(system: BlockSystem) -> float:
     ksp.setType("cg")
     ksp.getPC().setType("jacobi")
     ksp.setTolerances(rtol=1e-10, max_it=500)
+    from_options(eps)
     try:
         eps.solve()
         if eps.getConverged() < 1:
