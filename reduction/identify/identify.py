@@ -53,6 +53,7 @@ def identify(
     value by more than the noise, a direction that the data do not see.
 
     >>> import numpy as np, softgrasp as sg
+    >>> from softgrasp.reduction.identify.data import Measurements
     >>> keys = ["time.steps=100", "tissue.order=2", "tissue.refine={tolerance=3e-2}"]
     >>> model = sg.build("paper_forward", keys)
     >>> truth = sg.build("paper_forward", [*keys, "tissue.material.mu=60"])
@@ -60,7 +61,7 @@ def identify(
     >>> noise = np.random.default_rng(0).normal(0, 5e-3, run.outputs.shape)
     >>> data = Measurements("tip", run.times, run.outputs + noise)
     >>> found = sg.identify(model, data, fit="mu", noise=5e-3)
-    >>> abs(found.values[0] / 60 - 1) < 3 * found.total[0]
+    >>> bool(abs(found.values[0] / 60 - 1) < 3 * found.total[0])
     True
 
     Args:
