@@ -121,20 +121,20 @@ class Controller(Shown):
         return int(self.plant.B.shape[1])
 
     def reset(self, tissue: Array | None = None) -> None:
-        """Forget the past; the tissue starts at [eta, eta'] or, by default, hangs still."""
+        """Start anew with the tissue at [eta, eta'], (N - 2 n_s,); by default at rest."""
         n_s = self.n_s
         self._x = np.zeros(self.plant.N)
         self._x[2 * n_s :] = self.plant.rest_at(np.zeros(n_s))[0][2 * n_s :] if tissue is None else tissue
         self._fresh = True
 
     def command(self, x: Array) -> Array:
-        """The load for a known reduced state x (N,)."""
+        """Load for a known reduced state x (N,) [N, N m], (n_s,)."""
         u = self.K @ x
         u += self._offset
         return np.minimum(np.maximum(u, self._lower), self._upper)
 
     def step(self, q_s: Array, v_s: Array) -> Array:
-        """One tick: the load [N, N m] from the measured hand, after one step of the tissue."""
+        """Load after one tick of the tissue [N, N m], (n_s,), from the measured hand q_s [m, rad] and v_s, (n_s,)."""
         n_s, x = self.n_s, self._x
         step, accelerated, dragged, constant = self.model
         if not self._fresh:
@@ -150,7 +150,7 @@ class Controller(Shown):
 
     @property
     def tissue(self) -> Array:
-        """[eta, eta'] that the controller carries."""
+        """Current [eta, eta'] of the tissue, (N - 2 n_s,)."""
         return self._x[2 * self.n_s :].copy()
 
     def towards(self, q_bar: Array) -> Controller:
@@ -185,11 +185,11 @@ class Controller(Shown):
             about = {key: meta[key] for key in ("period", "scene_hash", "layout_hash", "about")}
             return cls(arrays["K"], arrays["x_bar"], arrays["u_bar"], plant, limits=arrays.get("limits"), **about)
         except KeyError as error:
-            raise ControlError(f"{path} holds no controller ({error} is missing); save it again") from error
+            raise ControlError(f"{path} has no controller ({error} is missing); save it again") from error
 
 
 def _tissue_step(plant: ReducedSystem, period: float) -> tuple[Array, Array, Array | None, Array]:
-    """Midpoint rule of the tissue rows of the plant for a hand whose velocity is known.
+    """Matrices of the midpoint rule of the tissue, y = [eta, eta'], for a hand whose velocity is known.
 
     y_{k+1} = step y_k + accelerated (v_{k+1} - v_k) [+ dragged (v_{k+1} + v_k)] + constant
     """
@@ -234,7 +234,7 @@ def load_gain(path: Path, layout: BlockLayout, scene_hash: str | None = None) ->
                 hand = (arrays["K_s"], arrays["q_s"], arrays["v_s"])
                 pieces = [(*hand, np.array(rows[a:b])) for a, b in ranges]
             except (KeyError, IndexError, ValueError) as error:
-                raise ControlError(f"{path} holds no full-order gain ({error}); save it again") from error
+                raise ControlError(f"{path} has no full-order gain ({error}); save it again") from error
     K_s, q_s, v_s, rows = layout.comm.scatter(pieces)
     K_z, K_v = (np.asfortranarray(part) for part in np.split(rows[:, :-2], 2, axis=1))
     return Gain(K_s, K_z, K_v), PlantState(q_s, v_s, rows[:, -2].copy(), rows[:, -1].copy())
@@ -246,7 +246,7 @@ def _named(path: Path) -> Path:
 
 
 def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Path:
-    """Write arrays and their description; a torn file never replaces a good one.
+    """Write arrays and their description; a torn file never replaces a good one. Returns the path, with .npz.
 
     Raises ControlError: the folder cannot be written.
     """
@@ -262,7 +262,7 @@ def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Pat
 
 
 def read_npz(path: Path, expected: dict[str, str | None]) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Read a file of :func:`write_npz` and check what it was made for.
+    """Description and arrays of a file of :func:`write_npz`; ``expected``: hashes that the description must have.
 
     Raises ControlError: the file is missing or damaged, or a hash differs.
     """

@@ -162,8 +162,9 @@ def summary(study: GainStudy) -> list[str]:
         reaches = "does not settle within 1 % of the way in this run" if arrived is None else (
             f"reaches the target, within 1 % of the way, in {arrived:.3g} s"
         )  # fmt: skip
-        first = f"The optimal gain {reaches}. {solved}".rstrip()
-        cost = f"The move costs {paid:.4g}; the Riccati equation predicts {optimal:.4g}."
+        free = "" if study.planned is None else " without obstacles and limits"
+        first = f"The optimal gain{free} {reaches}. {solved}".rstrip()
+        cost = f"The move{free} costs {paid:.4g}; the Riccati equation predicts {optimal:.4g}."
         if full.saturated:
             excess = (paid + study.loops.to_come) / optimal - 1
             cost = f"With the limits of the loads the move costs {excess:.2%} more than without them."
@@ -266,8 +267,12 @@ def compose(study: GainStudy, seconds: Mapping[str, float], pictures: Sequence[P
     result = Section("Result", rows=result_rows(study, seconds), terminal=True)
     if not isinstance(study, ControlStudy):
         return Page(f"{name}: optimal gain", summary(study), [*noted, result], {}, files, " --gain-only")
-    parts = sections(study, noted, result, pictures)
-    return Page(f"{name}: optimal feedback", summary(study), parts, csv_tables(study), [*pictures, *files])
+    parts, outcome = sections(study, noted, result, pictures), summary(study)
+    if study.planned is not None:
+        from softgrasp.study.control.obstacle.report import sentence
+
+        outcome = [sentence(study.planned), *outcome]
+    return Page(f"{name}: optimal feedback", outcome, parts, csv_tables(study), [*pictures, *files])
 
 
 def sections(study: ControlStudy, notes: Sequence[Section], result: Section, drawn: Sequence[Path]) -> list[Section]:

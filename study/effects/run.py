@@ -15,8 +15,9 @@ from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.errors import ResourceError, SolverError
-from softgrasp.fem.model.memory import free_bytes, size_text
+from softgrasp.fem.model.memory import free_bytes
 from softgrasp.fem.model.scales import rigid_inertia
+from softgrasp.fem.resources import size_text
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.experiments import SwitchRuns, check_elements
 from softgrasp.study.effects.measure import (

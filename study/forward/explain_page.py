@@ -9,8 +9,8 @@ from pathlib import Path
 from rich.console import Console
 
 from softgrasp.fem.effects.gate import SMALL_SHARE
-from softgrasp.fem.model.memory import size_text
 from softgrasp.fem.model.scales import SMALL_STRAIN
+from softgrasp.fem.resources import size_text
 from softgrasp.fem.run.forecast import RELIABLE, START, Forecast
 from softgrasp.study.forward.explain import EffectReport, Explanation, MeshReport, explain
 from softgrasp.study.report.origin import origin

@@ -13,8 +13,7 @@ from typing import Literal
 import numpy as np
 
 from softgrasp.fem.errors import SceneError, shortened
-from softgrasp.fem.model.memory import size_text
-from softgrasp.fem.resources import free_memory
+from softgrasp.fem.resources import free_memory, size_text
 from softgrasp.fem.run.motion import Profile
 from softgrasp.fem.scene.table import read_csv
 from softgrasp.fem.scene.text import out_of_range, read_text
