@@ -173,6 +173,14 @@ class FlatContact(Contact):
         obstacle, node, _ = self.row[on].T
         return Rows(obstacle.astype(np.intp), node.astype(np.intp), self.normals[obstacle], self.x[on])
 
+    def pressing(self) -> Array:
+        """See :meth:`Contact.pressing`."""
+        forces = np.zeros((self.p, self.d))
+        if self.pressed:
+            rows = self._pressed_rows()
+            np.add.at(forces, rows.node, rows.x[:, None] * rows.normal)
+        return forces
+
     def _sets(self) -> list[NDArray[Any]]:
         """See :meth:`Contact._sets`: the rows in their order, and the set with its factor."""
         m = len(self.small.active)
