@@ -47,7 +47,7 @@ def identify(
     refine: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Identified:
-    """theta = argmin sum |y_N(t; theta) - y|^2 / sigma^2 [BCL99], with the parts of its error. Collective.
+    """Values (mu, lambda, ..) = argmin sum |y_N(t) - y|^2 / sigma^2 [BCL99], and their errors by cause. Collective.
 
     The answer says by ``reasons`` why it must not be used: a misfit beyond chance, a mesh or a time step that changes a
     value by more than the noise, a direction that the data do not see.
