@@ -113,7 +113,7 @@ def parse_ranks(text: str) -> list[int]:
 
 
 def cpu_seconds(call: Callable[[], object]) -> float:
-    """Seconds of the processor that a call takes."""
+    """Processor time of a call [s]."""
     begin = time.process_time()
     call()
     return time.process_time() - begin

@@ -57,7 +57,7 @@ def models(sizes: list[int]) -> Iterator[tuple[str, int, Model]]:
 
 
 def measure(kind: str, order: int, model: Model) -> Iterator[Row]:
-    """A row for every solver that the model of costs knows at this size."""
+    """A row for every solver in the model of costs at this size."""
     system = model.system
     layout = system.layout
     work = Work(layout.n_e, layout.dimension, order, 1, 1, False, system.contrast)

@@ -1,4 +1,4 @@
-"""Every figure and table of the paper again, and a page that says what the paper has, what comes out here, and why.
+"""Every figure and table of the paper again, and a page with the paper's value, ours, and the reason of a difference.
 
 ``python demos/paper.py --out out/paper``: forward run, all bases, Riccati equation and closed loop [SBRH21].
 """
@@ -58,14 +58,14 @@ ABOUT = (
     "The hypotheses of the paper that do not come out here are kept in the tables as they came out.",
 )
 PAGES = (
-    "report.html in forward, accurate, reduce and control hold the scenes with their equations, all sizes, "
+    "report.html in forward, accurate, reduce and control have the scenes with their equations, all sizes, "
     "all points of the figures and the commands that make each alone."
 )
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
-USELESS = "no digit of its P is right, so that its time says nothing"
+USELESS = "no digit of its P is right, so that its time is no comparison"
 
 
 def at(points: list[dict[str, Any]], N: int) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def at(points: list[dict[str, Any]], N: int) -> dict[str, Any]:
 
 
 def digits(value: float | None, unit: str = "") -> str:
-    """Three digits; null in JSON stands for a number that is not finite."""
+    """Three digits; null in JSON is a number that is not finite."""
     return "not finite" if value is None else f"{value:.3g}{unit}"
 
 

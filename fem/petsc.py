@@ -19,10 +19,10 @@ from softgrasp.fem.errors import meet
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 SAME = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
-FEW_COLUMNS = 2  # up to which setting up a product of matrices costs more than it saves
+FEW_COLUMNS = 2  # up to which setting up a product of matrices needs more time than it saves
 BLOCK_COLUMNS = 8  # at least so many of a block
 FEW_ENTRIES = 524_288  # of eight columns and more, up to which SciPy's product is the faster one
-BLOCK_ENTRIES = 131_072  # about so many of a block of columns: room that the C library need not ask the system for
+BLOCK_ENTRIES = 131_072  # about so many of a block of columns: memory that the C library has at hand
 
 
 @contextmanager
@@ -99,7 +99,7 @@ def times_columns(A: PETSc.Mat, X: Array) -> Array:
     """A X for local rows of dense columns, (n_local, k), in the storage of the faster way. Collective.
 
     On one rank X stored by rows, or of eight columns and more with few entries, goes by SciPy's product, for which the
-    matrix keeps a copy, and other X by PETSc's in blocks; on more ranks all columns go at once, since every block costs
+    matrix keeps a copy, and other X by PETSc's in blocks; on more ranks all columns go at once, since every block needs
     messages. One or two columns, and a rank without rows, on which PETSc's product crashes, go by the product with
     vectors. Times of the ways: docs/benchmarks.md.
     """

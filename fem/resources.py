@@ -77,7 +77,7 @@ def check_room(comm: MPI.Intracomm, files: Sequence[Path], needed: int, reserve:
 
 
 def reserve_room(path: Path, size: int) -> None:
-    """Take room on the disk behind the end of a file: HDF5, which gives back the rest, ends the program without it.
+    """Allocate room on the disk behind the end of a file: HDF5, which gives back the rest, ends the program without it.
 
     Raises OSError: there is none, or the user's quota or the limit of a file's size is reached.
     """

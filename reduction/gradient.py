@@ -82,7 +82,7 @@ def gradient(
         dt: step [s].
         force: u on the hand at the step midpoints, (steps, n_s) [N, N m].
         hand: q_s and v_s of a prescribed hand, (steps + 1, n_s) each, instead of a force.
-        materials: one a layer; None takes those of the projection.
+        materials: one a layer; None: those of the projection.
         x0: initial state (N,); None is zero.
 
     Raises:

@@ -295,6 +295,28 @@ def query(
 
 
 @app.command(rich_help_panel=MODEL)
+def export(
+    model: Annotated[Path, typer.Argument(help="reduced model that `softgrasp reduce` or sg.save wrote, e.g. rom.h5")],
+    c: Annotated[
+        Path | None, typer.Option("--c", metavar="FOLDER", help="write C99 with its test into this folder")
+    ] = None,
+    tick: Annotated[float, typer.Option(help="time step of the exported model in seconds")] = 1e-3,
+) -> None:
+    """Write a reduced model for other programs: C99 that a robot or a simulator steps.
+
+    The load on the hand goes in, hand and outputs of the scene come out; mu, lambda and beta may change at any tick.
+
+    The C allocates nothing and calls no library. It brings a log of our own steps, which `make test` compares.
+
+    Example: softgrasp reduce paper_forward, then
+    softgrasp export out/paper_forward-reduce/models/craig_bampton.h5 --c plant; make -C plant test time
+    """
+    from softgrasp.study.export.run import run_export
+
+    run_export(model, console(), c=c, tick=tick)
+
+
+@app.command(rich_help_panel=MODEL)
 @takes("scene out set_ quiet pictures gain_only retune empty pdf")
 def control(
     gain_only: Annotated[

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from softgrasp.fem.scene.tissue import Refine
 
 # Estimate over tolerance that is let pass. Estimates are 0.5 to 1 of the error: where they lie is known after a pass,
-# when the corrected outputs of the new mesh tell the error of the old one.
+# when the corrected outputs of the new mesh give the error of the old one.
 ACCEPTED, SEEN, MOST_ACCEPTED = 0.45, 0.65, 0.8  # unseen; least and most after a pass: what was seen on shipped scenes
 MISSED = 2.0  # that of an a-priori mesh which missed its tolerance: there, nothing was promised to the percent
-GUESSED = 0.7  # what a pass aims at, at least: too many cells cost more than another pass
+GUESSED = 0.7  # least reduction that a pass aims at: too many cells need more time than another pass
 LINE_TRIES, LINE_STEP = 12, 0.7  # the number of lines grows with a small power of the tolerance
 
 
@@ -107,7 +107,7 @@ def adapted_mesh(model: Model) -> TissueMesh | None:
 def _effectivity(old: Array, error: Array, new: Array) -> float:
     """Estimate over error, e, from the estimates on two meshes, within what has been seen.
 
-    The corrected outputs of the new mesh still miss the share 1 - e of its error, so that they show m = old / error =
+    The corrected outputs of the new mesh still miss the share 1 - e of its error, and measure m = old / error =
     e / (1 - (1 - e) r) with r = new / old; solved for e.
     """
     a, b, c = (float(np.linalg.norm(part, axis=1).max()) for part in (old, error, new))

@@ -22,7 +22,7 @@ import meshio
 _SAFE = {".inp": "abaqus", ".mesh": "medit", ".vtk": "vtk", ".vtu": "vtu", ".xdmf": "xdmf", ".xmf": "xdmf"}
 _GMSH = b"$MeshFormat"  # .msh is a suffix of Ansys too
 _LAUNCHERS = ("PMI", "MPI", "OMPI", "HYDRA", "HYDI", "I_MPI", "SLURM")  # an HDF5 with MPI would join the running job
-LEAST, PER_BYTE = 10.0, 1e-6  # [s, s/byte]: ten times what text files take
+LEAST, PER_BYTE = 10.0, 1e-6  # [s, s/byte]: ten times the time of text files
 WAIT = 20  # seconds on the clock for one of the processor: others may use the machine
 
 

@@ -24,5 +24,5 @@ def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
 
     path = scene.directory / str(tissue.mesh)
     result = read_mesh(comm, path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit)
-    scene._mesh_digest = result.digest  # the hash of the scene is of what was read, not of what the file says later
+    scene._mesh_digest = result.digest  # the hash of the scene is of what was read, not of a later state of the file
     return result

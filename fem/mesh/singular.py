@@ -19,7 +19,7 @@ from softgrasp.fem.mesh.check import Flags, Floats, Integers, sort_facets
 Kind = Literal["contact end", "re-entrant", "held corner", "layer end"]
 
 KINDS: tuple[Kind, ...] = ("re-entrant", "contact end", "held corner")  # by the number of sides held
-REGULAR = 0.8  # exponents above cost no order that a mesh of practical size would show: 2 alpha is nearly that of P1
+REGULAR = 0.8  # exponents above lose no order that a mesh of practical size would show: 2 alpha is nearly that of P1
 STRAIGHT = 1e-6  # largest deviation of the angle of a flat boundary [rad]: rounding only
 
 

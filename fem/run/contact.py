@@ -332,6 +332,11 @@ class Contact:
 
     # ---- what is left of a run
 
+    def pressing(self) -> Array:
+        """Force of the obstacles on each boundary node in the last step, without impulses, (p, d) [N]."""
+        forces = self.forces if len(self.rows.node) else np.zeros_like(self.forces)
+        return forces.reshape(self.p, self.d)
+
     def check_hand(self, drive: TableDrive | ForceDrive, begin: int, end: int) -> None:
         """See that the nodes that follow the hand are in no obstacle at the steps from begin to before end.
 

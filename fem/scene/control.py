@@ -28,7 +28,7 @@ class Reduction(Section):
     )
     plugins: list[Label] = Field(
         default_factory=list,
-        description="Python files with bases of your own, whose names `methods` may then take [no unit]; they join the "
+        description="Python files with bases of your own, whose names `methods` may then have [no unit]; they join the "
         "comparison, and they run with your rights",
     )
     N: list[Annotated[int, Field(ge=1)]] = Field(
@@ -64,7 +64,7 @@ class Reduction(Section):
     )
     certify: Literal["off", "two", "proof", "estimate"] = Field(
         "off",
-        description="build one model that knows its error [no unit]: by two bases and a proof, by a proof or an "
+        description="one model with a bound or estimate of its error [no unit]: two bases and a proof, a proof or an "
         "estimate alone",
     )
     tolerance: Annotated[float, Field(gt=0, lt=1)] = Field(
@@ -127,7 +127,7 @@ class Loop(Section):
         "default",
     )
     delay: bool | Annotated[int, Field(ge=0, le=100)] = Field(
-        False, description="samples that the load acts late, true for one [1], held only"
+        False, description="delay of the load in samples, true for one [1], held only"
     )
 
 
@@ -140,7 +140,7 @@ class ControlOutput(Section):
     """One vector-valued output of the control problem."""
 
     kind: Literal["node", "region", "hand"] = Field(description="a node, the mean of a region, or the hand [no unit]")
-    point: list[float] | None = Field(None, description="the node nearest to it is taken [m]; kind node")
+    point: list[float] | None = Field(None, description="the output is that of the node nearest to it [m]; kind node")
     box: Box | None = Field(None, description="[[lo], [hi]] [m]; mean over the nodes inside; kind region")
     name: Label = Field("", description="label [no unit]")
 

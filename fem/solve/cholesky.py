@@ -1,7 +1,7 @@
-"""Cholesky in blocks of d x d of a matrix that one rank holds, and the order of its rows.
+"""Cholesky in blocks of d x d of a matrix that one rank stores, and the order of its rows.
 
-PETSc's solves with blocks take less time than those with single entries (``python -m benchmarks forward``
-prints both): one index serves d^2 numbers, and d unknowns at a time. But PETSc takes such a matrix in the order in
+PETSc's solves with blocks need less time than those with single entries (``python -m benchmarks forward``
+prints both): one index serves d^2 numbers, and d unknowns at a time. But PETSc factors such a matrix in the order in
 which it comes, so the rows are put in order first (:func:`dissect`); and it multiplies by inverses of
 the blocks on the diagonal, which is stable only while these are well conditioned [DHS95]. So two solves are measured,
 and a factor of single entries is made where blocks would lose digits.
@@ -52,7 +52,7 @@ class Dissection:
     order: NodeOrder  # of the nodes
     before: tuple[NDArray[Any], NDArray[Any]]  # row pointers and columns of the blocks before
     after: tuple[NDArray[Any], NDArray[Any]]  # row pointers and columns of the blocks in this order
-    source: NDArray[np.intp]  # where each block of ``after`` stood before
+    source: NDArray[np.intp]  # earlier place of each block of ``after``
 
     def matrix(self, A: PETSc.Mat) -> PETSc.Mat:
         """A of the same pattern with rows and columns in this order, in blocks of d x d (BAIJ).
@@ -91,7 +91,7 @@ def _rows(nodes: NDArray[np.intp], d: int) -> NDArray[np.intp]:
 
 
 # Stable factors leave below 1e-15, in whatever units and however ill-conditioned; blocks may leave 1e-14 and more, as
-# in the hard cases with layers or nu near 0.5. Ten rounding units tell them apart.
+# in the hard cases with layers or nu near 0.5. Ten rounding units separate them.
 BACKWARD_ERROR = 10 * float(np.finfo(float).eps)
 VANISHING_PIVOT = (71, 81)  # PETSC_ERR_MAT_LU_ZRPVT, PETSC_ERR_MAT_CH_ZRPVT
 
@@ -159,7 +159,7 @@ def make_ksp(P: PETSc.Mat, prefix: str, by: Literal["petsc", "mumps"] = "petsc")
     ksp = PETSc.KSP().create(P.comm)
     ksp.setOptionsPrefix(prefix)
     ksp.setOperators(P)
-    P.destroy()  # the ksp holds it
+    P.destroy()  # the ksp owns it
     ksp.setType("preonly")
     pc = ksp.getPC()
     pc.setType("cholesky")

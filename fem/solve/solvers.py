@@ -27,13 +27,13 @@ from softgrasp.fem.solve.stars import Stars, factored
 # Largest problem whose single entries PETSc's own Cholesky factors faster than MUMPS, where blocks lose digits.
 FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}  # 1: systems without a mesh
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}  # above, the factor itself does not fit
-# Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,
+# Below 1e-8 the residual needs no second look. Above, it proves little: a backward stable solve has eps |S| |w| / |r|,
 # which grows with the condition though w may be right. One step of refinement measures the error of w itself.
 DIRECT_RESIDUAL = 1e-8
 DIRECT_ERROR = 1e-6
 OUT_OF_MEMORY = 3  # PC_FACTOR_OUTMEMORY
 # Percent beyond the estimate that MUMPS reserves on each rank. With PETSc's 20 one of four set-ups on two ranks of a
-# busy machine failed, for a cause that was not found; pages that are not touched cost nothing.
+# busy machine failed, for a cause that was not found; pages that are not touched need no memory.
 WORKSPACE = 100
 PACKAGES = {"petsc": "PETSc", "mumps": "MUMPS"}  # PETSc's names of those that factor
 
@@ -60,7 +60,7 @@ def choose_solver(
         few: some static solves with one factor, not the steps of a run.
         contrast: largest lambda / mu, which iterations grow with.
         steps: of the run.
-        memory: that set-up and factor may take, over all ranks [byte].
+        memory: that set-up and factor may use, over all ranks [byte].
     """
     work = work_of(layout, FEW_SOLVES if few else steps, few, contrast)
     return work.solver(requested, memory), work.reason(requested, memory)
@@ -121,13 +121,13 @@ class TissueSolver:
     def columns(self, X: Array, where: str = "") -> Array:
         """S^-1 X of local rows (n_local, k), Fortran order; checked as :meth:`check` does if ``where`` is given.
 
-        Columns of zeros cost nothing. Collective.
+        Columns of zeros are not solved. Collective.
         """
         r, w = self.S.createVecs()
         result = np.zeros(X.shape, order="F")
         some = np.flatnonzero(total(self.S.comm.tompi4py(), np.abs(X).sum(axis=0)) != 0)
         divided = isinstance(self.factor, OrderedFactor)
-        if isinstance(self.factor, OrderedFactor):  # each rank holds the whole factor
+        if isinstance(self.factor, OrderedFactor):  # each rank stores the whole factor
             result[:, some] = self.factor.columns(X[:, some])
         try:
             for j in some:
@@ -313,7 +313,7 @@ def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, 
         raise
     finally:
         if P is not S:
-            P.destroy()  # the ksp holds what it needs
+            P.destroy()  # the ksp owns what it needs
     factor = ksp.getPC().getFactorMatrix() if order is None else _gathered(ksp, order, S)
     return TissueSolver("cholesky", ksp, S, tolerance, factor)
 
@@ -329,7 +329,7 @@ def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
         ) from error
     reason = ksp.getPC().getFailedReason()
     if reason:
-        why = "out of memory or workspace; take more ranks" if reason == OUT_OF_MEMORY else "the matrix is not definite"
+        why = "out of memory or workspace; use more ranks" if reason == OUT_OF_MEMORY else "the matrix is not definite"
         raise SolverError(f"{name}: set-up failed (reason {reason}); {why}")
 
 
@@ -337,9 +337,7 @@ def _stars(S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float, toleranc
     """CG with multigrid over vertex stars; flexible where the linear elements are iterated upon. Collective."""
     if layout.patches is None:
         S.destroy()
-        raise SolverError(
-            "stars: linear elements have no stars to smooth over; take tissue.order = 2 or another solver"
-        )
+        raise SolverError("stars: linear elements have no stars to smooth over; use tissue.order = 2 or another solver")
     ksp = PETSc.KSP().create(S.comm)
     ksp.setOptionsPrefix(prefix)
     ksp.setType("cg" if factored(layout) else "fcg")

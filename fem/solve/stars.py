@@ -87,7 +87,7 @@ class Stars:
         pc = ksp.getPC()
         if pc.getType() != "mg":
             pc.setType("mg")
-            pc.setMGLevels(2)  # the levels take the prefix of this moment
+            pc.setMGLevels(2)  # the levels get the prefix of this moment
             pc.setMGInterpolation(1, self.P)
         level, coarse = pc.getMGSmoother(1), pc.getMGCoarseSolve()
         level.setOperators(fine, smoother)
@@ -175,7 +175,7 @@ def star_inverses(S: PETSc.Mat, patches: Patches, d: int) -> Iterator[tuple[NDAr
 
 
 def equal_stars(patches: Patches, d: int) -> Iterator[NDArray[Any]]:
-    """Nodes (stars, m) of stars of one size, in parts whose inverses take little memory."""
+    """Nodes (stars, m) of stars of one size, in parts whose inverses need little memory."""
     sizes = np.unique(patches.star, return_counts=True)[1]
     first = np.append(0, np.cumsum(sizes))
     for m in np.unique(sizes):

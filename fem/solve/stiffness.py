@@ -35,7 +35,7 @@ def factored_stiffness(
     """K_ee, factored (or the set-up of cg and stars) on the first request, and kept while it is small. Collective.
 
     Args:
-        solver: None takes the one that suits few solves.
+        solver: its name; None: the one that suits few solves.
         rtol: of cg and stars, where no direct solver fits.
 
     Raises SolverError: the factorisation fails.
@@ -53,7 +53,7 @@ def factored_stiffness(
     if layout.n_e <= KEPT_LIMIT[layout.dimension] and (everywhere or layout.comm.size == 1):
         if kept is not None:
             kept[1].destroy()
-        system.kept["factor"] = key, made, K  # no other matrix can take the handle of one that is held
+        system.kept["factor"] = key, made, K  # no other matrix can get the handle of one that is referenced
         yield made
         return
     try:
@@ -63,7 +63,7 @@ def factored_stiffness(
 
 
 def static_columns(system: BlockSystem, X: Array) -> Array:
-    """K_ee^-1 X of local rows (n_local, k), Fortran order; columns of zeros cost nothing. Collective.
+    """K_ee^-1 X of local rows (n_local, k), Fortran order; columns of zeros are not solved. Collective.
 
     Raises SolverError: the factorisation fails, or the solution has a large residual.
     """

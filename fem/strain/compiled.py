@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 LAWS = Path(__file__).parent  # of law.h, which every source includes
-LANES = 8  # points that the C code takes at a time
+LANES = 8  # points that the C code treats at a time
 FLAGS = (f"-DLANES={LANES}", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 
 
@@ -43,7 +43,7 @@ def library(source: Path, declaration: str, otherwise: str) -> Any:
 
 
 def _shared(source: Path) -> Path:
-    """The shared library in the cache folder, made there unless it is there; its name says source and machine."""
+    """The shared library in the cache folder, made there unless it is there, named by hashes of source and machine."""
     compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
         raise OSError("there is no C compiler")

@@ -220,7 +220,7 @@ class Controller(Shown):
             about |= {"limits": arrays.get("limits"), "observer": _filter(meta, arrays)}
             return cls(arrays["K"], arrays["x_bar"], arrays["u_bar"], plant, **about)
         except KeyError as error:
-            raise ControlError(f"{path} holds no controller ({error} is missing); save it again") from error
+            raise ControlError(f"{path} has no controller ({error} is missing); save it again") from error
 
 
 def _filter(meta: dict[str, Any], arrays: dict[str, Array]) -> Filter | None:
@@ -280,7 +280,7 @@ def load_gain(path: Path, layout: BlockLayout, scene_hash: str | None = None) ->
                 hand = (arrays["K_s"], arrays["q_s"], arrays["v_s"])
                 pieces = [(*hand, np.array(rows[a:b])) for a, b in ranges]
             except (KeyError, IndexError, ValueError) as error:
-                raise ControlError(f"{path} holds no full-order gain ({error}); save it again") from error
+                raise ControlError(f"{path} has no full-order gain ({error}); save it again") from error
     K_s, q_s, v_s, rows = layout.comm.scatter(pieces)
     K_z, K_v = (np.asfortranarray(part) for part in np.split(rows[:, :-2], 2, axis=1))
     return Gain(K_s, K_z, K_v), PlantState(q_s, v_s, rows[:, -2].copy(), rows[:, -1].copy())

@@ -94,7 +94,7 @@ def compress(plant: Plant, Z: Block, allowed: float) -> Block:
 def _leading(G: Array, allowed: float) -> Array:
     """Columns U, fewest, whose span leaves out at most ``allowed`` of the trace of a semidefinite G; U'U = I.
 
-    A Cholesky factorisation with pivots, G = L L', first takes out the range of G, of about half its order; then
+    A Cholesky factorisation with pivots, G = L L', first removes the range of G, of about half its order; then
     L'L = V s V' of that order and U = L V s^{-1/2}. U'U = I to rounding of G / sqrt(s_i s_j): what that adds to
     U' G U is rounding of G.
     """

@@ -154,7 +154,7 @@ class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
 
     V starts with the lowest modes and K_ee^{-1} C_z and grows by S(p)^{-1} C_z (one complex solve each) at
     frequencies between the last mode and the highest one, until the gain changes by less than the tolerance between
-    two spaces, or the space holds all of the tissue. The small problem keeps the second-order form and the energy, so
+    two spaces, or the space is all of the tissue's. The small problem keeps the second-order form and the energy, so
     it is stable whenever the tissue is damped. The true residual of such a solution is some 1e-3 although the gain is
     right to 1e-8, its tissue's part to 1e-5; residual and changes of both parts are reported, not checked.
     """

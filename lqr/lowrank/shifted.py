@@ -25,7 +25,7 @@ from softgrasp.lqr.plant.checks import MODAL_KEY
 PREFIX = "softgrasp_shifted_"
 # Every rank factors whole matrices up to here, each rank another shift: no messages in the factorisation, and SuperLU
 # in complex numbers is about as fast as MUMPS on the real form of twice the order in 2D, faster in 3D
-# (docs/benchmarks.md). Beyond, a whole factor on each rank costs too much memory.
+# (docs/benchmarks.md). Beyond, a whole factor on each rank needs too much memory.
 GATHER_LIMIT = {1: 150_000, 2: 150_000, 3: 40_000}  # 1: systems without a mesh
 # n_e up to which SuperLU works column by column in 2D, where it is the faster way; in 3D it needs its panels
 THIN_UP_TO = 20_000
@@ -53,7 +53,7 @@ class FactorsAhead:
     def take(self, shifts: Sequence[complex]) -> scipy.sparse.linalg.SuperLU:
         """The factor of the first shift; the others are begun as far as threads are idle.
 
-        The caller hands what it holds of an older factor to :meth:`free` before.
+        The caller hands its older factor to :meth:`free` before.
         """
         known = len(self.threads) - (shifts[0] not in self.coming)  # one thread has to be left for the first
         for p in [p for p in self.coming if p not in shifts[: 1 + known]]:
@@ -63,13 +63,13 @@ class FactorsAhead:
         try:
             factor = future.result()
         finally:
-            del future  # in a traceback it would keep everything alive that the caller holds
+            del future  # in a traceback it would keep everything alive that the caller references
         self._begin(shifts[1:])
         return factor
 
     def _drop(self, p: complex) -> None:
         self.maker = self.coming[p][0]
-        self.free([self.coming.pop(p)])  # no name may hold it when the thread lets it go
+        self.free([self.coming.pop(p)])  # no name may refer to it when the thread lets it go
 
     def _begin(self, shifts: Sequence[complex]) -> None:
         for p in shifts[: 1 + len(self.threads)]:
@@ -79,7 +79,7 @@ class FactorsAhead:
                 self.coming[p] = (i, self.threads[i].submit(self.make, p, i))
 
     def free(self, box: list[object]) -> None:
-        """Empty a list with the only reference to the factor taken last, in the thread that made it."""
+        """Empty a list with the only reference to the last factor, in the thread that made it."""
         self.threads[self.maker].submit(box.clear)
 
     def close(self) -> None:
@@ -138,7 +138,7 @@ class ShiftedTissue(ABC):
 
 
 class GatheredTissue(ShiftedTissue):
-    """Every rank holds all rows; the factors of ``comm.size`` shifts are made at the same time, one a rank.
+    """Every rank stores all rows; the factors of ``comm.size`` shifts are made at the same time, one a rank.
 
     SuperLU in complex numbers with diagonal pivots and one fill-reducing order (nested dissection) for all shifts. A
     program of one rank that may use another core makes the next factors there while it works with the present one.
@@ -255,7 +255,7 @@ def _cores() -> int:
 
 
 def _lu_solve(lu: scipy.sparse.linalg.SuperLU, F: Array | Complex, order: NDArray[np.int64], real: bool) -> Complex:
-    """Solve with a factor of the permuted matrix; real factors take real and imaginary part one after the other."""
+    """Solve with a factor of the permuted matrix; real factors solve real and imaginary part in turn."""
     right = F[order]
     result = np.empty(F.shape, dtype=complex)
     if not real:
@@ -317,7 +317,7 @@ class DistributedTissue(ShiftedTissue):
         S = self._real_form(p)
         self.S.setValuesCSR(S.indptr, S.indices, S.data)
         self.S.assemble()
-        self.ksp.setOperators(self.S)  # without it setUp takes the old factor for good
+        self.ksp.setOperators(self.S)  # without it setUp considers the old factor valid
         try:
             self.ksp.setUp()
         except PETSc.Error as error:
@@ -368,7 +368,7 @@ def make_shifted(system: BlockSystem, name: str = "auto") -> ShiftedTissue:
 
 
 def shifted_factor_bytes(n: int, dimension: int) -> float:
-    """What MUMPS asks for to factor S(p) of order n, all ranks together: 240 n log2 n in 2D, 800 n^(4/3) in 3D.
+    """Memory of MUMPS to factor S(p) of order n, all ranks together: 240 n log2 n in 2D, 800 n^(4/3) in 3D.
 
     Fitted to n = 6 558 to 103 038 in 2D and n = 7 227 to 52 857 in 3D.
     """
@@ -382,5 +382,5 @@ def check_shifted_memory(layout: BlockLayout) -> None:
     if needed > free:
         raise ResourceError(
             f"the factor of the shifted tissue matrix (n_e = {layout.n_e} in {layout.dimension}D) needs about "
-            f"{needed:.1f} GiB and {free:.1f} GiB are free; take fewer cells, or set {MODAL_KEY}"
+            f"{needed:.1f} GiB and {free:.1f} GiB are free; use fewer cells, or set {MODAL_KEY}"
         )

@@ -58,7 +58,7 @@ class GainQuality:
     examined: bool = True  # whether the spectrum is that of the full plant; else of the modes kept
     sampled: SampledRadius | None = None  # radius from tick to tick; None where the instants are unknown
     gain: Gain | None = None  # gain K_hat; None where there is none
-    cost_excess_at_most: float = NAN  # bound on the excess cost of the loop as it runs; nan where not asked for
+    cost_excess_at_most: float = NAN  # bound on the excess cost of the loop as it runs; nan where not requested
     cost_excess_proved: float = NAN  # proved part of that bound, see softgrasp.lqr.design.orders.with_bounds
     bounded_to: float = NAN  # end of the run behind the two bounds [s]
 
@@ -87,7 +87,7 @@ class GainQuality:
         if not self.promising:
             return "the full loop is unstable"
         if np.isnan(self.cost_excess_at_most):
-            return "no bound was asked for"
+            return "no bound was requested"
         if np.isfinite(self.cost_excess_proved):
             return f"the loop as it runs does not settle within {self.bounded_to:.4g} s"
         return "the cost of the run overflows"
@@ -212,11 +212,11 @@ class GainCheck:
     def stability(self, gain: Gain) -> LoopQuality:
         """Abscissa and sampled radius of any gain, without its cost. Collective.
 
-        Plants of no more modes than ``loop`` keeps take all. Larger ones take the abscissa from
-        :func:`softgrasp.lqr.spectrum.certificate.abscissa`; where the certificate fails, all modes are taken up to
+        Plants of no more modes than ``loop`` keeps use all. Larger ones have the abscissa from
+        :func:`softgrasp.lqr.spectrum.certificate.abscissa`; where the certificate fails, all modes are used up to
         :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`.
 
-        Raises SolverError: no eigenvalue converges, and there are too many modes to take all.
+        Raises SolverError: no eigenvalue converges, and there are too many modes to use all.
         """
         K = gain.block
         if self.loop.complete:

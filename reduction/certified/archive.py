@@ -31,7 +31,7 @@ GROUP = "certificate"
 
 
 def save_certified(model: CertifiedModel, path: str | Path) -> None:
-    """Write a certified model to one HDF5 file, atomically. Collective when it holds a reconstruction.
+    """Write a certified model to one HDF5 file, atomically. Collective when it has a reconstruction.
 
     Raises:
         OSError: the file cannot be written.
@@ -104,7 +104,7 @@ def load_certified(path: str | Path, layout: BlockLayout | None = None) -> Certi
         group = file.get(GROUP)
         if group is None or group.attrs.get("format") != FORMAT:
             raise ModelError(
-                f"{path} holds no certificate of this version ({FORMAT!r}); "
+                f"{path} has no certificate of this version ({FORMAT!r}); "
                 "build it by softgrasp reduce SCENE --tolerance"
             )
         return CertifiedModel(read_linear(file, data, layout), **_read(group))

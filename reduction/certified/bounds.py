@@ -6,7 +6,7 @@ forces K^-1 (r^+ - r^) / dt and r - mean r^: in the energy norm |e|^2 = e_z'K e_
     |e'_0| = |r^_0|_{K^-1},   |e'_+| <= |e'| + dt sqrt(|(r^+ - r^) / dt|_{K^-1}^2 + |r - mean r^|_{M^-1}^2),
     |e| <= |e'| + |r^|_{K^-1}.
 
-Here r^ is the mean of its neighbours, which takes the ringing of steps out of it. Damping only helps. The textbook
+Here r^ is the mean of its neighbours, which removes the ringing of steps. Damping only helps. The textbook
 bound |e| <= dt sum |r|_{M^-1} charges what the basis lacks at every step anew.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from softgrasp.fem.petsc import Array
 
 POINTS, PLACES = 400, 400  # frequencies of a kernel's maximum, and steps at which it is computed
-SAFETY = 1.01  # of the kernel: its maximum is taken on a grid
+SAFETY = 1.01  # of the kernel: its maximum is computed on a grid
 GAIN = 1.0  # decay over the run, in powers of e, from which a kernel is worth its cost
 
 
@@ -28,7 +28,7 @@ def node_average(rows: Array, first: Array | None = None, nodes: Array | None = 
 
     Args:
         rows: values at the midpoints, (w, steps).
-        first: node value at the start, (w,); None takes the first midpoint value.
+        first: node value at the start, (w,); None: the first midpoint value.
         nodes: array for the node values; None makes one.
     """
     nodes = np.empty((len(rows), rows.shape[1] + 1)) if nodes is None else nodes

@@ -168,10 +168,10 @@ class CertifiedModel(Shown):
         """A run of the small basis with its certificate. Online; not collective.
 
         Args:
-            materials: one per layer; None takes those of the projection.
-            drive: what moves the hand; None takes the scene's motion.
-            tolerance: relative; None takes that of the model.
-            gravity: acceleration of free fall (n_s,) [m/s^2]; None takes that of the scene.
+            materials: one per layer; None: those of the projection.
+            drive: what moves the hand; None: the scene's motion.
+            tolerance: relative; None: that of the model.
+            gravity: acceleration of free fall (n_s,) [m/s^2]; None: that of the scene.
             allow: return a run above the tolerance too.
             prove_time_step: prove the error of the step as well, by a second certified run at the finer step.
 
@@ -217,7 +217,7 @@ class CertifiedModel(Shown):
     def _given(self, drive: Drive | None) -> Drive:
         drive = self.drive if drive is None else drive
         if drive is None:
-            raise ModelError("give the motion of the hand, or the force on it; the model holds none", self.fine.name)
+            raise ModelError("give the motion of the hand, or the force on it; the model has none", self.fine.name)
         return drive
 
     def _each(

@@ -81,7 +81,7 @@ class Motion:
     v_s: Array  # velocity of the hand, (steps + 1, n_s) [m/s, rad/s]
     outputs: Array  # (steps + 1, p) [m, rad]
     size: float  # largest energy norm
-    residual: Residual | None  # None where it was not asked for
+    residual: Residual | None  # of every step; None for runs without a bound
     modes: Modes | None = None  # modes of the run; None where it was not made mode by mode
     w: Array | None = None  # states in the modes, (k, 2, steps + 1); None without modes
     x: Array | None = None  # states x, (steps + 1, N); None with modes
@@ -126,7 +126,7 @@ def padded(x: Array, N: int, n_s: int) -> Array:
 
 
 def known_hand(model: ReducedModel, drive: Drive, gravity: Array) -> tuple[Array, Array] | None:
-    """Tables of the hand, which one-way coupling knows beforehand; None two-way under a force.
+    """Tables of the hand, which are known beforehand with one-way coupling; None two-way under a force.
 
     Raises:
         ModelError: the tables do not fit.

@@ -145,7 +145,7 @@ class Orthonormal:
 
     Args:
         system: system of the tissue, for the distribution of the rows and the choice of the solver.
-        W: matrix of the norm, symmetric positive definite; None stands for W^-1 = ``product``.
+        W: matrix of the norm, symmetric positive definite; None: W^-1 = ``product``.
         product: matrix W^-1 itself, which needs no solver; None where W is given.
     """
 
@@ -199,7 +199,7 @@ class Orthonormal:
         return np.asarray(self.comm.bcast(T))
 
     def destroy(self) -> None:
-        """Free what PETSc holds. Collective."""
+        """Free the PETSc objects. Collective."""
         if self.product is None:
             self.solver.destroy()
 

@@ -65,7 +65,7 @@ def certified_model(
     Args:
         model: the scene.
         Phi: local rows (n_local, k2).
-        k: modes of the answer; None takes all, with one basis.
+        k: modes of the answer; None: all, with one basis.
         space: residuals of these modes; None makes them at the materials of the scene.
         places: parameters at which duals of the outputs are to be good; none: no duals.
         about: other fields of :class:`softgrasp.reduction.certified.model.CertifiedModel`.
@@ -95,7 +95,7 @@ def certified_any(model: Model, rom: ReducedModel, **about: Any) -> CertifiedMod
     Canonical models and those without structure tie velocities to displacements loosely: their bound is larger.
 
     Raises:
-        ModelError: the model holds no basis on the mesh, or its basis has no certificate.
+        ModelError: the model has no basis on the mesh, or its basis has no certificate.
     """
     columns = slice(2 * model.system.layout.n_s, None)
     assert rom.reconstruction is not None

@@ -184,7 +184,7 @@ def contact_keys(contact: ContactRecord) -> dict[str, Any]:
                 "gap_min": float(contact.gap[:, o].min()),
                 "touch_share": float((contact.touching[:, o] > 0).mean()),
                 "force_max": float(np.linalg.norm(contact.force[:, o], axis=1).max()),
-                "force_end": contact.force[-1, o].tolist(),
+                "force_end": contact.force_end[o].tolist(),
                 "impulse": contact.impulse[:, o].sum(axis=0).tolist(),
                 "nodes_max": int(contact.touching[:, o].max()),
             }
@@ -198,7 +198,7 @@ def contact_rows(contact: ContactRecord) -> list[tuple[str, str]]:
     rows = []
     for o, name in enumerate(contact.names):
         count, gap = int(contact.touching[:, o].max()), float(contact.gap[:, o].min())
-        force = ", ".join(f"{x:.4g}" for x in contact.force[-1, o])
+        force = ", ".join(f"{x:.4g}" for x in contact.force_end[o])
         touched = (
             f"force ({force}) N at the end, at most {counted(count, 'node')} touching"
             if count

@@ -17,7 +17,16 @@ from PIL import Image
 from softgrasp.fem.columns import Array
 from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.fem.owned import note
-from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, legend, make_axes, make_shot, name_layers
+from softgrasp.study.pictures.body import (
+    Shot,
+    colour_bar,
+    draw_scene,
+    draw_surroundings,
+    legend,
+    make_axes,
+    make_shot,
+    name_layers,
+)
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.pictures.style import TARGET, colour_map, fit, paper_style
 
@@ -29,20 +38,33 @@ REST = 1.0  # [s] the last frame stays longer
 
 
 def gif_move(
-    picture: PictureMesh, frames: Array, times: Array, table: Array, target: npt.ArrayLike | None, out_gif: Path
+    picture: PictureMesh,
+    frames: Array,
+    times: Array,
+    table: Array,
+    target: npt.ArrayLike | None,
+    out_gif: Path,
+    tractions: Array | None = None,
 ) -> Path:
     """:func:`move_bytes` as a file, whose name is returned."""
-    return write_gif(move_bytes(picture, frames, times, table, target), out_gif)
+    return write_gif(move_bytes(picture, frames, times, table, target, tractions), out_gif)
 
 
-def move_bytes(picture: PictureMesh, frames: Array, times: Array, table: Array, target: npt.ArrayLike | None) -> bytes:
+def move_bytes(
+    picture: PictureMesh,
+    frames: Array,
+    times: Array,
+    table: Array,
+    target: npt.ArrayLike | None,
+    tractions: Array | None = None,
+) -> bytes:
     """A GIF of body, hand, path and target in motion, in real time from 0.3 to 30 s; at most 60 frames and 3 MB.
 
     Too many frames are thinned out; for the arguments see :func:`softgrasp.study.pictures.body.figure_move`.
     """
     kept, durations = timing(times)
     frames, times = frames[kept].astype(np.float64), times[kept]
-    shot = make_shot(picture, frames, times, table, target)
+    shot = make_shot(picture, frames, times, table, target, None if tractions is None else tractions[kept])
     return gif_bytes(_render(shot, frames, times), durations)
 
 
@@ -72,6 +94,7 @@ def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
         legend(figure, axes, shot)
 
         def draw(k: int) -> None:
+            draw_surroundings(axes[0], shot, [k])
             draw_scene(axes[0], shot, frames[k : k + 1], None, shot.hands[k : k + 1])
             name_layers(axes[0], shot, frames[k], inside=True)  # beside the body they would change sides
             stamp.set_text(f"t = {times[k]:.{digits}f} s{note}")

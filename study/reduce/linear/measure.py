@@ -89,7 +89,7 @@ def bases_of(
                 rule = []  # it may be the share that fails; what fails in general fails again
                 continue
             limit = "the snapshots carry above rounding" if method.snapshots else "this mesh has modes for"
-            reason = f"more than {limit}; ask for N <= {most}" if larger else error.reason
+            reason = f"more than {limit}; request N <= {most}" if larger else error.reason
             refused |= dict.fromkeys(larger or sizes, reason)
             sizes = [N for N in sizes if larger and N not in larger]
         else:

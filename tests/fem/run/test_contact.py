@@ -158,11 +158,11 @@ def test_a_free_hand_rests_with_its_weight_on_the_table() -> None:
 
 
 @pytest.mark.parametrize("overrides", [[TABLE, BETA], [DISC, *TWO, *SHORT], [DISC, *SHORT]])
-def test_restart_in_contact_repeats_the_bits(overrides: list[str], tmp_path: Path) -> None:
+def test_restart_in_contact_repeats_the_bits(overrides: list[str], mpi_tmp_path: Path) -> None:
     whole, model = run(*overrides), build("paper_forward", [*SMALL, ON, *overrides])
     with pytest.raises(Paused):
-        simulate(model, RunOptions(tmp_path, until=101))
-    again = simulate(build("paper_forward", [*SMALL, ON, *overrides]), RunOptions(tmp_path, resume=True))
+        simulate(model, RunOptions(mpi_tmp_path, until=101))
+    again = simulate(build("paper_forward", [*SMALL, ON, *overrides]), RunOptions(mpi_tmp_path, resume=True))
     assert whole.contact.touching[:101].max() > 0
     assert np.array_equal(again.final, whole.final)
     for name in ("force", "impulse", "gap", "touching"):
@@ -220,6 +220,6 @@ def test_a_start_inside_and_a_hand_that_meets_an_obstacle_are_refused() -> None:
     with pytest.raises(SceneError, match=r"obstacle 'disc1' holds the node of the tissue at .* m deep; move it"):
         run("obstacle=[{kind='disc', center=[0.5, 0.2], radius=0.3}]")
     model = build("paper_forward", [*SMALL, ON, TABLE])
-    held = model.system.layout.held[0].tolist()
+    held = np.concatenate(MPI.COMM_WORLD.allgather(model.system.layout.held))[0].tolist()
     with pytest.raises(SoftgraspError, match="the hand meets obstacle 'disc1' at t = 0 s"):
         run(f"obstacle=[{{kind='disc', center={held}, radius=0.01}}]")

@@ -446,7 +446,7 @@ def test_a_plain_model_holds_no_certificate(comm: MPI.Intracomm, tmp_path: Path)
 
     certified = ritz(build(make_scene(), comm=comm), 2, 3)
     save(certified.fine, tmp_path / "plain.h5")
-    with pytest.raises(ModelError, match="holds no certificate"):
+    with pytest.raises(ModelError, match="has no certificate"):
         load_certified(tmp_path / "plain.h5")
     save_certified(certified, tmp_path / "certified.h5")
     assert load(tmp_path / "certified.h5").N == certified.fine.N
