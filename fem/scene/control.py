@@ -247,10 +247,12 @@ class Observer(Section):
         default_factory=list, description="points of the tissue whose displacement is measured, nearest free nodes [m]"
     )
     noise: SampleNoise = Field(
-        default_factory=SampleNoise, description="standard deviations of the samples {pose, marker, speed, force}"
+        default_factory=SampleNoise,
+        description="standard deviations of the samples {pose, marker, speed, force} [m, N]",
     )
     disturbance: Disturbances = Field(
-        default_factory=Disturbances, description="what moves hand and tissue besides the loads {hand, load, box}"
+        default_factory=Disturbances,
+        description="what moves hand and tissue besides the loads {hand, load, box} [m/s2, N per sqrt(Hz)]",
     )
     N: Annotated[int, Field(ge=8)] = Field(
         14, description="states of the filter that runs, those of the hand included [1], even"

@@ -129,20 +129,20 @@ class Controller(Shown):
         return int(self.plant.B.shape[1])
 
     def reset(self, tissue: Array | None = None) -> None:
-        """Forget the past; the tissue starts at [eta, eta'] or, by default, hangs still."""
+        """Start anew with the tissue at [eta, eta'], (N - 2 n_s,); by default at rest."""
         n_s = self.n_s
         self._x = np.zeros(self.plant.N)
         self._x[2 * n_s :] = self.plant.rest_at(np.zeros(n_s))[0][2 * n_s :] if tissue is None else tissue
         self._fresh = True
 
     def command(self, x: Array) -> Array:
-        """The load for a known reduced state x (N,)."""
+        """Load for a known reduced state x (N,) [N, N m], (n_s,)."""
         u = self.K @ x
         u += self._offset
         return np.minimum(np.maximum(u, self._lower), self._upper)
 
     def step(self, q_s: Array, v_s: Array, y: Array | None = None) -> Array:
-        """One tick: the load [N, N m] from the measured hand, after one step of the tissue.
+        """Load after one tick of the tissue [N, N m], (n_s,), from the measured hand q_s [m, rad] and v_s, (n_s,).
 
         ``y``: samples of the observer beside those of the hand [m, N], in the order of its names; an entry that is no
         number, or None for all, is lost.
@@ -181,7 +181,7 @@ class Controller(Shown):
 
     @property
     def tissue(self) -> Array:
-        """[eta, eta'] that the controller carries."""
+        """Current [eta, eta'] of the tissue, (N - 2 n_s,)."""
         return self._x[2 * self.n_s :].copy()
 
     def towards(self, q_bar: Array) -> Controller:
@@ -235,7 +235,7 @@ def _filter(meta: dict[str, Any], arrays: dict[str, Array]) -> Filter | None:
 
 
 def _tissue_step(plant: ReducedSystem, period: float) -> tuple[Array, Array, Array | None, Array]:
-    """Midpoint rule of the tissue rows of the plant for a hand whose velocity is known.
+    """Matrices of the midpoint rule of the tissue, y = [eta, eta'], for a hand whose velocity is known.
 
     y_{k+1} = step y_k + accelerated (v_{k+1} - v_k) [+ dragged (v_{k+1} + v_k)] + constant
     """
@@ -292,7 +292,7 @@ def _named(path: Path) -> Path:
 
 
 def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Path:
-    """Write arrays and their description; a torn file never replaces a good one.
+    """Write arrays and their description; a torn file never replaces a good one. Returns the path, with .npz.
 
     Raises ControlError: the folder cannot be written.
     """
@@ -308,7 +308,7 @@ def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Pat
 
 
 def read_npz(path: Path, expected: dict[str, str | None]) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Read a file of :func:`write_npz` and check what it was made for.
+    """Description and arrays of a file of :func:`write_npz`; ``expected``: hashes that the description must have.
 
     Raises ControlError: the file is missing or damaged, or a hash differs.
     """
