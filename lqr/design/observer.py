@@ -20,7 +20,7 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
 
 WEIGHTS = (1.0, 10.0, 100.0)  # of the noise that stands for what the filter leaves out, until the full loop is stable
-ONE_BY_ONE = 8  # markers up to which the loop without each is judged, a spectrum of the full plant
+ONE_BY_ONE = 8  # markers up to which the loop without each is examined, a spectrum of the full plant
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class ObservedControl:
     judged: Judged
     """Full plant, filter and gain."""
     without: dict[str, float]
-    """Abscissa of the whole loop where a marker, or all samples but those of the hand, are lost for good [1/s]."""
+    """Abscissa of the whole loop where a marker, or all samples but those of the hand, never arrive [1/s]."""
     full: FullFilter | None
     """Kalman filter of the full tissue from the markers; None without markers."""
     sd_full: Array | None
@@ -97,7 +97,7 @@ def _check(design: Design) -> None:
     layout, loop = design.problem.layout, control_of(design.model).loop
     if layout.n_e > DENSE_LIMIT:
         raise ControlError(
-            f"an observer is judged with all modes of the plant, at most {DENSE_LIMIT}; this scene has {layout.n_e}: "
+            f"an observer is checked with all modes of the plant, at most {DENSE_LIMIT}; this scene has {layout.n_e}: "
             "take a coarser mesh"
         )
     if design.modal:

@@ -69,7 +69,7 @@ class Judged:
     """The full plant under an observer and a gain."""
 
     abscissa: float  # largest log |lambda| / period of the loop [1/s]
-    abscissa_known: float  # the same where the whole state is known [1/s]
+    abscissa_known: float  # largest log |lambda| / period under the optimal gain on the known state [1/s]
     cost: float  # J a second that the disturbances cause; infinite where the loop is not stable [1/s]
     cost_known: float  # least J a second, where the whole state is known [1/s]
     sd_outputs: Array  # standard deviation of the outputs from their target [m, rad], (o,)

@@ -166,7 +166,7 @@ def test_what_step_cannot_take_is_refused() -> None:
         ("effects.damping=false", "damping"),
         ("control.method='modal'", "leave out control.method = 'modal'"),
         ("control.loop={sampling='held',rate=2.0,delay=1}", "give control.observer.delay instead"),
-        ("tissue.cells=[30,60]", "an observer is judged with all modes of the plant, at most 1300"),
+        ("tissue.cells=[30,60]", "an observer is checked with all modes of the plant, at most 1300"),
     ],
 )
 def test_scenes_without_an_observer_are_refused(override: str, sentence: str) -> None:
