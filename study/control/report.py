@@ -9,19 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.columns import hand_columns
-from softgrasp.lqr.design.feedback import Design, running_words
-from softgrasp.lqr.design.orders import BasisGains
-from softgrasp.lqr.loop.margins import LoopMargins
-from softgrasp.lqr.plant.problem import RiccatiSolution, rigid_gains
-from softgrasp.lqr.reduced.riccati import GainQuality
+from softgrasp.fem import hand_columns
+from softgrasp.lqr import BasisGains, Design, GainQuality, LoopMargins, RiccatiSolution, rigid_gains, running_words
 from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, gain_change, settled
 from softgrasp.study.forward.result import trajectory_header
-from softgrasp.study.pictures.shapes import speed_up
+from softgrasp.study.pictures import speed_up
+from softgrasp.study.report import Columns, Section, Table, captioned, entry, table_of
 from softgrasp.study.report.equation import control_equation
-from softgrasp.study.report.page import Section, captioned
-from softgrasp.study.report.tables import Columns, Table, entry, table_of
-from softgrasp.study.shell.session import Page
+from softgrasp.study.shell import Page
 
 Row = tuple[Any, ...]
 LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal")

@@ -9,18 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem.columns import farthest
-from softgrasp.fem.petsc import Array
-from softgrasp.lqr.design.controller import CertifiedController
-from softgrasp.lqr.design.duration import LoopPlan
+from softgrasp.fem import Array, farthest
+from softgrasp.lqr import BasisGains, CertifiedController, GainQuality, LoopPlan, LoopTrajectory, RetunedGain, Target
 from softgrasp.lqr.design.feedback import Design, running_words
-from softgrasp.lqr.design.orders import BasisGains
-from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
 from softgrasp.lqr.plant.problem import RiccatiSolution, rigid_gains, translation_defect, velocity_defect
-from softgrasp.lqr.plant.target import Target
-from softgrasp.lqr.reduced.retune import RetunedGain
-from softgrasp.lqr.reduced.riccati import GainQuality
 from softgrasp.study.forward.result import newton_keys
 from softgrasp.study.report.origin import origin, peak_memory_mb
 

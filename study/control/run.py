@@ -11,23 +11,15 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TaskProgressColumn
 
-from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.owned import remove_own
-from softgrasp.fem.scene.control import Loop
+from softgrasp.fem import Loop, Model, Stopwatch, remove_own, scene_hash
+from softgrasp.lqr import A_PRIORI, Design, PlantState, control_of, finite_problem, linearised, with_control
 from softgrasp.lqr.design.duration import plan
-from softgrasp.lqr.design.feedback import Design, design
-from softgrasp.lqr.design.linearise import finite_problem, linearised
+from softgrasp.lqr.design.feedback import design
 from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, reduce_gains
-from softgrasp.lqr.design.scene import control_of, with_control
-from softgrasp.lqr.plant.gain import PlantState
-from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control import measure, report
 from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
-from softgrasp.study.pictures.background import draw_in_background
-from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Flags, Page, Session
+from softgrasp.study.pictures import Frames, draw_in_background
+from softgrasp.study.shell import Flags, Page, Session, folder_lock
 
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from rich.console import Console
 from rich.text import Text
 
-from softgrasp.fem.errors import SceneError, SoftgraspError, one_line
+from softgrasp.fem import SceneError, SoftgraspError, one_line
 from softgrasp.study.shell.streams import outlive_readers, write_utf8
 
 RANK = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK")  # set by launchers, known before MPI is loaded
