@@ -261,7 +261,9 @@ def compose(study: GainStudy, seconds: Mapping[str, float], pictures: Sequence[P
     noted = [Section("Notes", text=notes, terminal=True)] if notes else []
     result = Section("Result", rows=result_rows(study, seconds), terminal=True)
     if not isinstance(study, ControlStudy):
-        return Page(f"{name}: optimal gain", summary(study), [*noted, result], {}, files, " --gain-only")
+        return Page(
+            f"{name}: optimal gain", summary(study), [*noted, *_observed(study), result], {}, files, " --gain-only"
+        )
     parts, outcome = sections(study, noted, result, pictures), summary(study)
     if study.planned is not None:
         from softgrasp.study.control.obstacle.report import sentence
@@ -288,6 +290,7 @@ def sections(study: ControlStudy, notes: Sequence[Section], result: Section, dra
         Section("", figures=pick("move.png", "move.gif")),
         *notes,
         *planned,
+        *_observed(study),
         replace(result, figures=pick("histories.png", "decay.png")),
         Section("Equation", equation=control_equation(study.design.model.scene)),
     ]
@@ -300,6 +303,15 @@ def sections(study: ControlStudy, notes: Sequence[Section], result: Section, dra
         own = [] if i else pick("retune.png")
         parts.append(table_of(r.points, BOX, "" if i else "Re-tuning").section(text, figures=own))
     return parts
+
+
+def _observed(study: GainStudy) -> list[Section]:
+    """The observer, where there is one."""
+    if study.observed is None:
+        return []
+    from softgrasp.study.control.observer.report import observer_sections
+
+    return observer_sections(study.observed)
 
 
 def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Section]:
