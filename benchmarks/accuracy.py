@@ -75,7 +75,7 @@ class TolerancePoint:
     bound: float
     corrected: float
     time_run: float  # a-priori mesh, assembly and run
-    time_all: float  # with the estimate, and the passes it asks for
+    time_all: float  # processor time of run, estimate and further passes [s]
 
 
 COLUMNS = {
@@ -102,7 +102,7 @@ def meshes() -> dict[str, list[str]]:
 
 
 def graded(order: int, goal: float, more: str = ",passes=0") -> list[str]:
-    """``--set`` of a graded mesh, a-priori unless ``more`` says otherwise."""
+    """``--set`` of a graded mesh, a-priori unless ``more`` names another method."""
     return [f"tissue.order={order}", f"tissue.refine={{tolerance={goal:g}{more}}}"]
 
 
@@ -122,7 +122,7 @@ def off(y: Array, exact: Array) -> float:
 
 
 def median(task: Callable[[], object]) -> float:
-    """Seconds of the processor that a task takes, the median of repeats after a first one."""
+    """Processor time of a task [s], the median of repeats after a first one."""
     return statistics.median([cpu_seconds(task) for _ in range(REPEATS + 1)][1:])
 
 

@@ -1,4 +1,4 @@
-"""What a certified answer costs beside the full run, and what its proof costs of it."""
+"""Time of a certified answer over that of the full run, and the share of its proof."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ HELP = f"""Certified answers of the paper's scene with Kelvin-Voigt damping, {K}
 Each repeat draws a new material, for which every answer and the full run are made from the start, in turn, each after
 a call of its own kind that is not timed; medians of CPU time on one rank. The proof's share is that of an answer less
 the same answer without it: with two bases the estimate alone, with one basis the reduced run alone, mode by mode. A
-query has the time step's error in it. The proof of one basis stands also beside the same run in state space: operators
+query has the time step's error in it. The proof of one basis is compared with its run in state space too: operators
 at the material, propagator, steps. A fast look: --cells 15."""
 
 
@@ -135,7 +135,7 @@ def measure(nx: int, repeats: int) -> Iterator[AnswerCost]:
 
 
 def goals_of(rows: list[AnswerCost]) -> list[Goal]:
-    """What was asked for: of all answers, of the proof of one basis beside its run in state space, and of queries."""
+    """Goals: of all answers, of the proof of one basis beside its run in state space, and of queries."""
     goals = []
     for r in rows:
         name = f"nx = {r.cells}, {r.answer}"

@@ -20,7 +20,7 @@ from rich.console import Console
 from benchmarks import driver
 from benchmarks.driver import Row
 from softgrasp.fem.errors import SoftgraspError
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report.document import Table
 
 LIMIT = 1800.0  # [s] of one run of a command
 NAME = "bench_figures"
@@ -28,7 +28,7 @@ HELP = """Run the commands behind the ten most prominent figures of README and p
 
 A command runs as a user types it, in a process of its own; its figures are read from the files that it writes.
 Speed-ups and times are of the processor, so that other work on the machine hardly changes them. Commands that
-bench_figures.json in --out holds often enough are not run again, unless --only names them."""
+bench_figures.json in --out has often enough are not run again, unless --only names them."""
 
 
 def at(path: str, times: float = 1.0) -> Callable[[Row], float]:
@@ -63,9 +63,9 @@ class Number:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure, told by one or two numbers."""
+    """A figure of one or two numbers."""
 
-    text: str  # what it says
+    text: str  # meaning of the numbers, with {} for each
     numbers: tuple[Number, ...]
 
 
@@ -73,10 +73,10 @@ class Figure:
 class Command:
     """A command and the figures that it prints."""
 
-    name: str  # as --only takes it
+    name: str  # argument of --only
     line: str  # as a user types it, without --out
     figures: tuple[Figure, ...]
-    file: str = "result.json"  # that holds the numbers
+    file: str = "result.json"  # file of the numbers, relative to the folder of results
 
     def arguments(self, out: Path) -> list[str]:
         """For a process of this Python."""
@@ -130,7 +130,7 @@ COMMANDS = (
 def run_once(command: Command) -> tuple[Row, float]:
     """What one run of a command wrote, and its processor time [s].
 
-    Raises SoftgraspError: it failed or took too long.
+    Raises SoftgraspError: it failed or did not end in time.
     """
     with tempfile.TemporaryDirectory() as folder:
         out, before = Path(folder) / "out", resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -140,7 +140,7 @@ def run_once(command: Command) -> tuple[Row, float]:
             raise SoftgraspError(f"{command.line}: no end after {LIMIT:g} s") from error
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         if done.returncode:
-            said = (done.stderr or done.stdout).strip().splitlines()[-1:] or ["it says nothing"]
+            said = (done.stderr or done.stdout).strip().splitlines()[-1:] or ["it printed nothing"]
             raise SoftgraspError(f"{command.line}: status {done.returncode}: {said[0]}")
         result = json.loads((out / command.file).read_text())
     return result, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
@@ -164,7 +164,7 @@ def short(value: float) -> str:
 
 
 def table_of(found: Row) -> Table:
-    """One line a figure: what it says, median, least and most of each of its numbers, command."""
+    """One line a figure: its meaning, median, least and most of each of its numbers, command."""
     lines: list[list[str]] = []
     for command in COMMANDS:
         if command.name not in found:

@@ -1,4 +1,4 @@
-"""What the forward run costs, as one table, JSON, CSV and figure: ``python -m benchmarks forward``."""
+"""Time and memory of the forward run, as one table, JSON, CSV and figure: ``python -m benchmarks forward``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.console import Console
 from benchmarks import driver
 from benchmarks.driver import Failure, Goal
 from benchmarks.forward_rows import ForwardCost
-from softgrasp.study.report.tables import Table, number
+from softgrasp.study.report.document import Table, number
 from softgrasp.study.shell.timing import power_law
 
 SIZES = "2d:1000,2d:10000,2d:100000,3d:50000"
@@ -26,7 +26,7 @@ METHODS = ("ts", "solve", "own", "loop", "scipy", "pymor")
 LABELS = ("PETSc TS", "bare solve", "bare solve, blocks", "textbook loop", "SciPy", "pyMOR")
 FACTORS = {"here": "here", "petsc": "PETSc's Cholesky", "scipy": "SciPy (SuperLU)"}
 WHOLE = {"ts_none": "TS", "ts_memory": "TS storing every state", "scipy": "SciPy storing", "pymor": "pyMOR"}
-HELP = f"""Measure what a forward run costs and print one table.
+HELP = f"""Measure time and memory of a forward run and print one table.
 
 Every row is a program of its own under mpiexec. In it all methods take turns, several times, and the median
 counts, so that noise of the machine hits all alike. Columns: assembly and factor [s]; microseconds of one time step
@@ -79,7 +79,7 @@ def exponents(points: Sequence[ForwardCost]) -> dict[str, dict[str, float | None
 
 
 def goals(points: Sequence[ForwardCost]) -> list[Goal]:
-    """All goals that the points can speak for."""
+    """All goals that the measured points decide."""
     result = []
     for p in points:
         label = f"{p.problem}, {p.ranks} rank(s)"

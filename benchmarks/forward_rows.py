@@ -29,7 +29,7 @@ DT = 0.005  # [s], that of the paper: 600 steps in 3 s
 PAPER_STEPS = 600
 REPEAT_SECONDS = 0.1  # of the TS steps: long against the timer, short against the moods of a shared machine
 BUILD_SECONDS = 20.0  # assembly and factor are repeated at most this long
-PYMOR_LIMIT = 12_000  # [n_e]; its LU of size 2 n_e takes minutes beyond
+PYMOR_LIMIT = 12_000  # [n_e]; beyond, its LU of size 2 n_e needs minutes
 PEER_SHARE = 3  # SciPy and pyMOR need about so many times longer a step
 
 
@@ -173,7 +173,7 @@ def _loads(model: Model) -> Array:
 def _loops(run: Run, factor: dict[str, float]) -> tuple[dict[str, Any], list[Any]]:
     """The bare solves and the textbook loop, and what is to be freed after them; notes PETSc's factor time. Collective.
 
-    The textbook loop takes PETSc's plain solve on one rank; on several, where vectors are distributed, ours.
+    The textbook loop uses PETSc's plain solve on one rank; on several, where vectors are distributed, ours.
     """
     system, midpoint, name = run.model.system, run.midpoint, run.solver[0]
     bare = BareSolve(midpoint.solver, midpoint.r)
@@ -233,9 +233,9 @@ def measure(
     peers: bool = True,
     problem: str = "",
 ) -> ForwardCost:
-    """One point, each number taken ``repeats`` times. Collective.
+    """One point, each number measured ``repeats`` times. Collective.
 
-    One repeat takes about ``repeat_seconds``; ``whole``: also the paper's 600 steps; ``peers``: SciPy and pyMOR too.
+    One repeat lasts about ``repeat_seconds``; ``whole``: also the paper's 600 steps; ``peers``: SciPy and pyMOR too.
     """
     cells = cells_for(dimension, size)
     build(bench_scene(comm, dimension, [2] * (dimension - 1) + [4], 1), comm=comm)  # compiles the forms
@@ -273,5 +273,5 @@ def _sizes(model: Model, cells: list[int]) -> dict[str, Any]:
 
 
 def measure_row(*, large: bool, **arguments: Any) -> list[ForwardCost]:
-    """The point that :mod:`benchmarks.forward` asks for. Collective."""
+    """The point that :mod:`benchmarks.forward` names on the command line. Collective."""
     return [(measure_large if large else measure)(MPI.COMM_WORLD, **arguments)]

@@ -25,9 +25,9 @@ from softgrasp.reduction.bases.registry import METHODS, find_method
 from softgrasp.reduction.replay import full_run
 from softgrasp.study.reduce.linear.measure import sweep
 from softgrasp.study.reduce.times import steps_seconds
+from softgrasp.study.report.document import Table
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import machine
-from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.ending import console
 from softgrasp.study.shell.session import list_files
 from softgrasp.study.shell.timing import power_law
@@ -38,7 +38,7 @@ HELP = f"""Mesh study of the paper's block: tissue unknowns from 1e3 to 1e6, one
 
 Prints for every mesh the full run, the offline time (basis and projection, from {KEPT} snapshots) and the online time
 of the reduced model, then the exponents with which they grow and the mesh from which a reduced run is faster than a
-full one. LONG: the full run at n_e = 1e6 takes many minutes and several GB; a fast look: --sizes 1e3,3e3,1e4. Keep the
+full one. LONG: the full run at n_e = 1e6 needs many minutes and several GB; a fast look: --sizes 1e3,3e3,1e4. Keep the
 machine quiet."""
 
 
@@ -92,7 +92,7 @@ def break_even(rows: Sequence[MeshRow]) -> float | None:
 
 
 def findings(rows: Sequence[MeshRow]) -> dict[str, Any]:
-    """Exponents, spread of the online time, break-even mesh; None where one mesh does not tell."""
+    """Exponents, spread of the online time, break-even mesh; None where there is one mesh only."""
     n_e, online = [row.n_e for row in rows], [row.time_online for row in rows]
     return {
         "exponent_full": power_law(n_e, [row.time_full for row in rows]),

@@ -1,4 +1,4 @@
-"""How far the proved bounds of outputs lie above the truth, and what an answer with them costs."""
+"""How far the proved bounds of outputs lie above the truth, and the time of an answer with them."""
 
 from __future__ import annotations
 

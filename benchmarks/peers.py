@@ -1,6 +1,6 @@
 """The same time loop by other means, for the benchmark: textbook PETSc loop, plain SciPy, pyMOR.
 
-Every method starts from rest, takes the load l_n = G c_n of step n and can be asked for k more steps.
+Every method starts from rest, has the load l_n = G c_n of step n and can make k more steps.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class PlainCholesky(BareSolve):
         self.r, self.w = S.createVecs()
         self.r.set(1.0)
         self.solve = self.ksp.getPC().getFactorMatrix().solve
-        S.destroy()  # the ksp holds it
+        S.destroy()  # the ksp owns it
 
 
 class ScipyLoop:
@@ -100,7 +100,7 @@ class ScipyLoop:
             self._step()
 
     def store(self, k: int) -> Array:
-        """Take k steps and keep every [z; v], shape (2 n_e, k + 1)."""
+        """Make k steps and keep every [z; v], shape (2 n_e, k + 1)."""
         n_e = len(self.z)
         X = np.zeros((2 * n_e, k + 1), order="F")
         X[:n_e, 0], X[n_e:, 0] = self.z, self.v
@@ -153,7 +153,7 @@ class PymorLoop:
         self.x: Array = np.zeros(2 * n_e)
 
     def advance(self, k: int) -> None:
-        """Take k steps; the first one factors."""
+        """Make k steps; the first one factors."""
         for _ in range(k):
             state, _t = next(self._states)
         self.x = state.to_numpy().ravel()

@@ -1,4 +1,4 @@
-"""What the large Riccati equation costs, beside other codes: ``python -m benchmarks riccati``."""
+"""Time and memory of the large Riccati equation, beside other codes: ``python -m benchmarks riccati``."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from softgrasp.lqr.plant.operators import costates_to_relative, gain_to_absolute
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.riccati import gain_error, tissue_gain_error
 from softgrasp.lqr.riccati import Method, make_solver
+from softgrasp.study.report.document import number
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import peak_memory_mb
-from softgrasp.study.report.tables import number
 from softgrasp.study.shell.timing import power_law, repeated
 
 SIZES = "10,20,40,80,160"
@@ -46,7 +46,7 @@ LIMITS = {("newton_adi", 10): 0.2, ("newton_adi", 80): 20.0, ("galerkin", 10): 0
 LARGE_SECONDS, LARGE_MB = 900.0, 24 * 1024
 RESIDUAL, GAIN = 1e-10, 1e-6
 METHODS: tuple[Method, ...] = ("newton_adi", "radi", "galerkin")
-REPEAT_SECONDS = 3.0  # a method is repeated while it has taken less
+REPEAT_SECONDS = 3.0  # a method is repeated until its runs have lasted so long
 STAGES = {
     "factor": ("factor",),
     "solve": ("solve",),
@@ -207,7 +207,7 @@ def measure_peer(nx: int, beta: float, peer: str) -> Iterator[SolverPoint | Fail
 
 
 def measure_row(**arguments: Any) -> Iterator[SolverPoint | Failure]:
-    """The points that the launcher asks for. Collective."""
+    """The points that the launcher names. Collective."""
     return (measure_peer if "peer" in arguments else measure)(**arguments)
 
 
@@ -226,7 +226,7 @@ class Record:
         return driver.of(SolverPoint, self.rows)
 
     def resume(self) -> None:
-        """Take what an earlier run with this damping has measured. Raises CheckpointError: not such a file."""
+        """Read the rows of an earlier run with this damping. Raises CheckpointError: not such a file."""
         adapter = TypeAdapter(list[SolverPoint])
         try:
             old = json.loads(self.file.read_text()) if self.file.is_file() else {}
@@ -234,7 +234,7 @@ class Record:
                 rows, peers = (adapter.validate_python(old[key]) for key in ("rows", "peers"))
                 self.rows, self.peers = [*rows], [*peers]
         except (ValueError, KeyError, AttributeError) as error:
-            raise CheckpointError(f"{self.file} holds no rows of this version; run once without --resume") from error
+            raise CheckpointError(f"{self.file} has no rows of this version; run once without --resume") from error
 
     def kept(self, nx: int, ranks: int, methods: Sequence[str]) -> Rows:
         """The points of a row where all its methods are there."""
@@ -261,7 +261,7 @@ def exponents(points: Sequence[SolverPoint]) -> dict[str, float | None]:
 
 
 def goals(points: Sequence[SolverPoint]) -> list[Goal]:
-    """All goals that the points can speak for."""
+    """All goals that the measured points decide."""
     result = []
     for p in points:
         label = f"{p.method}, 2n = {p.states}, {p.ranks} rank(s)"
@@ -339,7 +339,7 @@ def collect_peers(console: Console, meshes: list[int], record: Record) -> None:
             record.peers.append(Failure(peer, 1, "not installed"))
             continue
         for nx in meshes:
-            label, why = f"{peer}, nx = {nx}", "left out, it takes many minutes or too much memory beyond nx ="
+            label, why = f"{peer}, nx = {nx}", "left out, it needs many minutes or too much memory beyond nx ="
             spec = {"nx": nx, "beta": record.beta, "peer": peer}
             record.peers += known[peer, nx] or (
                 [Failure(label, 1, f"{why} {limit}")]

@@ -16,7 +16,7 @@ from benchmarks import driver
 from benchmarks.driver import Failure, Goal
 from benchmarks.scale_rows import STEPS, ScaleCost, scale_scene
 from softgrasp.fem.run.forecast import forecast
-from softgrasp.study.report.tables import Table, number
+from softgrasp.study.report.document import Table, number
 from softgrasp.study.shell.timing import power_law
 
 SIZES = (
@@ -35,7 +35,7 @@ HELP = f"""Measure how runs grow with unknowns and ranks, stage by stage, and ho
 
 Stages: mesh and assembly (build), factor or set-up of the preconditioner, equilibrium under gravity, one of {STEPS}
 steps, one field file. Every row is a program of its own under mpiexec; seconds are processor time of its slowest rank.
-Rows on more ranks than there are cores tell counts only: iterations, and the operations of the busiest rank over the
+Rows on more ranks than there are cores give counts only: iterations, and the operations of the busiest rank over the
 mean. Strong scaling: --ranks on the same sizes; weak scaling: --weak, the unknowns of a rank, on --counts ranks.
 
 The figure has the model's lines to {LARGEST:.0e} unknowns on {DRAWN[-1]} ranks, and the rows measured here on them."""
@@ -91,7 +91,7 @@ def _pair(row: ScaleCost, name: str) -> tuple[float, float]:
 
 
 def goals(rows: Sequence[ScaleCost]) -> list[Goal]:
-    """Exponents that the rows can speak for; a factor in 3D, the equilibrium and the run with one are left out."""
+    """Exponents that the rows determine; a factor in 3D, the equilibrium and the run with one are left out."""
     result = []
     for label, powers in exponents(timed(rows)).items():
         direct = label.startswith("3D") and not label.endswith(("stars", "cg"))

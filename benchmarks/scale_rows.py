@@ -22,10 +22,10 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.shell.timing import processor_seconds
 
-STEPS = 200  # of the run that is told
-MOST_TIMED = 40  # steps that are taken
+STEPS = 200  # of the run whose time is reported
+MOST_TIMED = 40  # steps that are timed
 FIRST = 5  # steps before the timed ones: the guesses of iterative solvers need some
-SECONDS = 3.0  # of the timed steps, about, where 40 take more
+SECONDS = 3.0  # of the timed steps together [s], about, where 40 would need more
 NEARLY = "tissue.material={young=69e3, poisson=0.49, rho=1070.0}"  # silicone
 
 
@@ -70,7 +70,7 @@ class Stages:
         self.balance: dict[str, float] = {}
 
     def take(self, name: str, call: Callable[[], Any], times: int = 1) -> None:
-        """Note what a call costs, over so many times that it does the same."""
+        """Record the processor time of a call, divided by the number of times that it does the same."""
         before = PETSc.Log.getFlops()
         self.seconds[name] = processor_seconds(self.comm, call) / times
         mine = PETSc.Log.getFlops() - before
@@ -80,7 +80,7 @@ class Stages:
 
 
 def measure_row(*, kind: str, size: int, solver: str = "auto") -> list[ScaleCost]:
-    """A run of so many unknowns, stage by stage, no more steps than tell their time. Collective."""
+    """A run of so many unknowns, stage by stage, with as many steps as their time needs. Collective."""
     comm = MPI.COMM_WORLD
     build(scale_scene(comm, kind, 10), comm=comm)  # compiles the forms
     base = peak_memory_mb(comm)

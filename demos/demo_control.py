@@ -46,7 +46,7 @@ if speak:
 assert force @ [5.0, 3.0] > 0  # it pulls towards the target
 
 # %% [markdown]
-# Your own loop: each millisecond measure the hand, ask the controller, apply the force. Here a free hand stands
+# Your own loop: each millisecond measure the hand, ask the controller, apply the force. Here a free hand represents
 # for the robot.
 
 # %%

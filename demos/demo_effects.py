@@ -22,11 +22,11 @@ assert heavy.inventory.forms == plain.inventory.forms
 assert heavy.inventory.operators == plain.inventory.operators
 a, b = simulate(plain), simulate(heavy)
 if comm.rank == 0:
-    print(f"gravity moves the tip by up to {np.abs(a.outputs - b.outputs).max():.3g} m and costs no operator")
+    print(f"gravity moves the tip by up to {np.abs(a.outputs - b.outputs).max():.3g} m and needs no operator")
 assert np.abs(a.outputs - b.outputs).max() > 1e-3
 
 # %% [markdown]
-# Kelvin-Voigt damping `D = beta K` needs no matrix of its own either; it takes the vibration out of the tissue.
+# Kelvin-Voigt damping `D = beta K` needs no matrix of its own either; it damps the vibration of the tissue.
 
 # %%
 longer = ["time.end=6.0", "time.steps=1200"]  # the hand rests from t = 3 s on

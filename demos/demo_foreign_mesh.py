@@ -1,7 +1,7 @@
 # %% [markdown]
 # # A mesh from elsewhere
 # The small pillow of deformable-gym (BSD-3-Clause, licence beside the mesh): tetrahedra that nobody here made, held at
-# the flat bottom, sagging under gravity, lifted; Kelvin-Voigt damping takes the vibration out.
+# the flat bottom, sagging under gravity, lifted; Kelvin-Voigt damping damps the vibration.
 # Then the same body with marks, cell tags for a stiff core and facet tags for the bottom, from `.msh`
 # and from `.vtu`.
 
@@ -36,7 +36,7 @@ assert abs(sag[1] - sag[0]) < 1e-3 * abs(sag[0])  # still in equilibrium after o
 assert run.energy_drift < 1e-11  # work, energy and dissipation balance to rounding
 
 # %% [markdown]
-# Marks in the file say what is what: a layer takes its cells by tag, the contact zone its facets. meshio reads many
+# Marks in the file name its parts: a layer has its cells by tag, the contact zone its facets. meshio reads many
 # formats; `.msh` keeps the tags as physical groups, `.vtu` as cell data.
 
 # %%

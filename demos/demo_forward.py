@@ -28,7 +28,7 @@ assert abs(run.q_s[-1] - [5, 3]).max() < 1e-12  # a prescribed motion ends where
 assert run.energy_drift < 1e-12  # the midpoint rule conserves quadratic invariants: rounding only
 
 # %% [markdown]
-# What the mesh costs: the same scene on a graded mesh, cells shrinking towards the ends of the contact zone. The
+# The error of the mesh: the same scene on a graded mesh, cells shrinking towards the ends of the contact zone. The
 # deformation, the tip against the hand, has an error of 40 % on the paper's mesh, and of 0.1 % on the graded one.
 
 # %%
@@ -50,4 +50,4 @@ for mu in (20.0, 50.0, 200.0, 500.0):
     if MPI.COMM_WORLD.rank == 0:
         print(f"mu = {mu:5.0f} Pa: the tip lags behind the hand by up to {lag[mu]:.3g} m")
 assert sorted(lag.values(), reverse=True) == list(lag.values())
-assert lag[500.0] < lag[50.0] / 4  # nearly static lag goes with 1 / stiffness; lambda stays, resonance takes a part
+assert lag[500.0] < lag[50.0] / 4  # nearly static lag goes with 1 / stiffness; lambda stays, resonance has a share

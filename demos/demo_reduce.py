@@ -30,8 +30,8 @@ for method in ("psd", "psd_svd_like", "craig_bampton"):
 assert off["craig_bampton"] < 0.01 < off["psd"]  # PSD in the plain product spends its columns on the translation
 
 # %% [markdown]
-# The model is affine in the material, so another stiffness costs some small matrices. How good it is there only a full
-# run tells: undamped vibrations of slightly wrong frequency drift out of phase.
+# The model is affine in the material, so another stiffness needs small matrices only. Its error there needs a full
+# run to measure: undamped vibrations of slightly wrong frequency drift out of phase.
 
 # %%
 rom = sg.reduce(model, run, "craig_bampton", N=30)
@@ -44,8 +44,8 @@ assert here < 2e-3  # a thousandth of the deformation
 assert here < there < 0.15  # the shapes of lambda = mu do not span those of lambda = 2 mu
 
 # %% [markdown]
-# A query needs no mesh: the model lies in one file, and another material costs some small matrices. `softgrasp query`
-# asks a model that also proves how far it can be off (guide: certified models).
+# A query needs no mesh: the model lies in one file, and another material needs small matrices only. `softgrasp query`
+# asks a model that also proves a bound of its error (guide: certified models).
 
 # %%
 if speak:

@@ -1,4 +1,4 @@
-"""Every figure and table of the paper again, and a page that says what the paper has, what comes out here, and why.
+"""Every figure and table of the paper again, and a page with the paper's value, ours, and the reason of a difference.
 
 ``python demos/paper.py --out out/paper``: forward run, all bases, Riccati equation and closed loop [SBRH21].
 """
@@ -19,8 +19,8 @@ from softgrasp.study.control.result import TITLES
 from softgrasp.study.control.run import run_control
 from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.reduce.run import run_reduce
-from softgrasp.study.report.page import Section, write_report
-from softgrasp.study.report.tables import percent
+from softgrasp.study.report.document import Page, Section, percent
+from softgrasp.study.report.page import write_report
 
 Row = tuple[str, str, str, str, str]
 HEADER = ("quantity", "paper", "here", "verdict", "why different")
@@ -58,14 +58,14 @@ ABOUT = (
     "The hypotheses of the paper that do not come out here are kept in the tables as they came out.",
 )
 PAGES = (
-    "report.html in forward, accurate, reduce and control hold the scenes with their equations, all sizes, "
+    "report.html in forward, accurate, reduce and control have the scenes with their equations, all sizes, "
     "all points of the figures and the commands that make each alone."
 )
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
-USELESS = "no digit of its P is right, so that its time says nothing"
+USELESS = "no digit of its P is right, so that its time is no comparison"
 
 
 def at(points: list[dict[str, Any]], N: int) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def at(points: list[dict[str, Any]], N: int) -> dict[str, Any]:
 
 
 def digits(value: float | None, unit: str = "") -> str:
-    """Three digits; null in JSON stands for a number that is not finite."""
+    """Three digits; null in JSON is a number that is not finite."""
     return "not finite" if value is None else f"{value:.3g}{unit}"
 
 
@@ -273,8 +273,7 @@ def write_page(out: Path, results: dict[str, dict[str, Any]]) -> list[Path]:
     forward, control = forward_rows(results["forward"], results["reduce"]), control_rows(results["control"])
     forward += mesh_rows(results["forward"], results["accurate"])
     figures = [(out / name, text) for name, text in FIGURES if (out / name).exists()]
-    page = write_report(
-        out / "paper.html",
+    page = Page(
         title="The paper, again",
         summary=[_count(forward + control), *_differ(forward + control)],
         subtitle="Shuva, Buchfink, Röhrle, Haasdonk: Reduced Basis Methods for Efficient Simulation of a Rigid Robot "
@@ -287,7 +286,7 @@ def write_page(out: Path, results: dict[str, dict[str, Any]]) -> list[Path]:
             Section("Pages behind it", text=PAGES),
         ],
         files=[out / name / "report.html" for name in ("forward", "accurate", "reduce", "control")],
-        reproduce="make paper",
+        command="make paper",
         numbers="paper.json, and result.json in forward, accurate, reduce and control",
     )
     data = out / "paper.json"
@@ -295,7 +294,7 @@ def write_page(out: Path, results: dict[str, dict[str, Any]]) -> list[Path]:
     data.write_text(
         json.dumps({k: [dict(zip(HEADER, r, strict=True)) for r in v] for k, v in tables.items()}, indent=2)
     )
-    return [page, data]
+    return [write_report(out / "paper.html", page, files=page.files), data]
 
 
 def _table(title: str, rows: list[Row]) -> Section:

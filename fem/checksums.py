@@ -1,4 +1,4 @@
-"""Files that are read back only as they were written: a manifest, and arrays whose SHA-256 it holds."""
+"""Files that are read back only as they were written: a manifest, and arrays whose SHA-256 it contains."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> str:
         hashed = _Hashed(file)
         np.savez(hashed, allow_pickle=False, **arrays)
         file.flush()
-        os.fsync(file.fileno())  # some disks say only now that they are full
+        os.fsync(file.fileno())  # some disks report only now that they are full
     return hashed.sha.hexdigest()
 
 
@@ -63,7 +63,7 @@ def read_arrays(path: Path, sha256: str | None, advice: str = AGAIN) -> dict[str
     """Read arrays back.
 
     Args:
-        sha256: what its manifest says; None if the manifest does not know it.
+        sha256: that of its manifest; None where the manifest has none.
         advice: what to do about a damaged file.
 
     Raises CheckpointError: the file is missing or not as it was written.
@@ -71,7 +71,7 @@ def read_arrays(path: Path, sha256: str | None, advice: str = AGAIN) -> dict[str
     try:
         with no_pipe(path).open("rb") as file:
             if hashlib.file_digest(file, "sha256").hexdigest() != sha256:
-                raise CheckpointError(f"{path} is damaged: it is not what its manifest says; {advice}")
+                raise CheckpointError(f"{path} is damaged: its SHA-256 is not that of its manifest; {advice}")
             file.seek(0)
             with np.load(file, allow_pickle=False) as data:
                 return dict(data)
@@ -102,7 +102,7 @@ def read_manifest(path: Path, format: int, advice: str = AGAIN) -> dict[str, Any
     except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{path} cannot be read ({error}); {advice}") from error
     if not isinstance(entry, dict):
-        raise CheckpointError(f"{path} is damaged: it holds no table; {advice}")
+        raise CheckpointError(f"{path} is damaged: it has no table; {advice}")
     if isinstance(entry.get("format"), int) and entry["format"] != format:
         raise CheckpointError(
             f"{path} was written by another version of softgrasp (format {entry['format']}, this one reads {format}); "

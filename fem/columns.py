@@ -57,7 +57,7 @@ def labels(columns: Sequence[OutputColumn]) -> tuple[str, ...]:
 
 
 def hand_of(n_s: int, outputs: Sequence[str]) -> Columns:
-    """The hand's degrees of freedom where only the labels of the outputs tell whether it moves in space."""
+    """The hand's degrees of freedom where only the labels of the outputs determine whether it moves in space."""
     return hand_columns(n_s, 3 if n_s == 6 or any(name.endswith("_z") for name in outputs) else 2)
 
 
@@ -73,7 +73,7 @@ def farthest(outputs: Array, target: Array, columns: Sequence[OutputColumn] = ()
     Args:
         outputs: (m, p).
         target: (p,).
-        columns: one per output component; those without axis, and all when there are none, are taken as one vector.
+        columns: one per output component; those without axis, and all when there are none, count as one vector.
     """
     known = [*columns, *[OutputColumn("")] * (outputs.shape[1] - len(columns))]
     groups: dict[str, list[int]] = {}

@@ -1,6 +1,6 @@
 """Errors for users, raised on all ranks or on none.
 
-Every message is one sentence that names the file, key or value and says what would be right.
+Every message is one sentence that names the file, key or value and what would be right.
 """
 
 from __future__ import annotations
@@ -77,11 +77,11 @@ class Interrupted(SoftgraspError):
 
 
 class Paused(Interrupted):
-    """A run has reached the step at which it was asked to pause."""
+    """A run has reached the step at which it was to pause."""
 
 
 def meet(comm: MPI.Intracomm) -> None:
-    """Barrier that sleeps when it takes long, since a rank that spins takes a core from those that work. Collective."""
+    """Barrier that sleeps after a while, since a rank that spins occupies a core that others need. Collective."""
     if comm.size == 1:
         return
     everyone, begin, nap = comm.Ibarrier(), time.monotonic(), 0.0

@@ -42,7 +42,7 @@ def of_hand(values: Array, names: Sequence[str], *, rate: str = "", load: bool =
 
 
 def of_columns(values: Array, columns: Columns, dimension: str, *, rate: str = "", load: bool = False) -> Quantity:
-    """A quantity with one column per component; ``rate`` follows the unit, ``load`` takes forces and torques."""
+    """A quantity with one column per component; ``rate`` follows the unit, ``load`` labels forces and torques."""
     units = tuple(f"{c.load_unit if load else c.unit}{rate}" for c in columns)
     labels = tuple(c.axis for c in columns) if dimension == "hand" else tuple(c.label for c in columns)
     return Quantity(values, labels, units, dimension, mid=load)
@@ -86,7 +86,7 @@ class Labelled(ABC):
     def to_pandas(self) -> Any:
         """The run as ``pandas.DataFrame``, one column a component, "outputs tip_x [m]". Not collective.
 
-        What acts within a step stands in the row of its end, nan in the first.
+        What acts within a step is in the row of its end, nan in the first.
 
         Raises SoftgraspError: pandas is not installed.
         """
@@ -103,7 +103,7 @@ class FullOrderRun(Labelled):
     """A run of the full model, whose outputs have columns."""
 
     LOAD: ClassVar[str]
-    """Name of the field that holds the force on the hand in each step."""
+    """Name of the field with the force on the hand in each step."""
     outputs: Array
     """Outputs, (steps + 1, p) [m, rad]."""
     outputs_rigid: Array

@@ -36,18 +36,30 @@ class Patches:
 class BlockLayout(Shown):
     """Sizes and ownership of q = [q_s; q_e]."""
 
-    comm: MPI.Intracomm  # of the tissue blocks
-    dimension: int  # space dimension d
-    n_s: int  # hand degrees of freedom, on every rank
-    n_e: int  # tissue degrees of freedom, global
-    n_local: int  # tissue degrees of freedom owned by this rank
-    start: int  # global number of the first one
-    nodes: Array  # coordinates [m] of the owned free nodes, (n_local / d, d)
-    reference: Array  # the hand's reference point [m], (d,)
-    order: int = 1  # of the elements
-    extent: float = 1.0  # longest side of the bounding box of the free nodes [m], the same on every rank
-    held: Array = field(default_factory=lambda: np.zeros((0, 0)))  # owned nodes that follow the hand [m], (k, d)
-    patches: Callable[[], Patches] | None = None  # makes the stars when first asked, collective; None for linear cells
+    comm: MPI.Intracomm
+    """Communicator of the tissue blocks."""
+    dimension: int
+    """Dimension d of space."""
+    n_s: int
+    """Number of the hand's degrees of freedom, on every rank."""
+    n_e: int
+    """Number of the tissue's degrees of freedom over all ranks."""
+    n_local: int
+    """Number of the tissue's degrees of freedom owned by this rank."""
+    start: int
+    """Global number of this rank's first degree of freedom."""
+    nodes: Array
+    """Coordinates of the owned free nodes [m], (n_local / d, d)."""
+    reference: Array
+    """Reference point of the hand [m], (d,)."""
+    order: int = 1
+    """Order of the elements."""
+    extent: float = 1.0
+    """Longest side of the bounding box of the free nodes [m], the same on every rank."""
+    held: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """Coordinates of the owned nodes that follow the hand [m], (k, d)."""
+    patches: Callable[[], Patches] | None = None
+    """Function that makes the stars, collective; None for linear elements."""
 
     @property
     def states(self) -> int:

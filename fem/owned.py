@@ -38,7 +38,7 @@ class Process:
 
     @classmethod
     def own(cls) -> Process:
-        """The process that asks."""
+        """This process."""
         host = socket.gethostname()
         with suppress(OSError):
             host += f" {os.readlink('/proc/self/ns/pid')}"
@@ -73,7 +73,7 @@ _outer: list[_Held] = []  # folders of the commands inside which the running one
 def hold(folder: Path) -> None:
     """Make and lock a folder until :func:`release` or the end of this process, and release the one before.
 
-    Not collective: call on rank 0, and :func:`follow` on the others. Raises SceneError: another process holds it.
+    Not collective: call on rank 0, and :func:`follow` on the others. Raises SceneError: another process has locked it.
     """
     global _held
     home = folder.resolve()
@@ -86,7 +86,7 @@ def hold(folder: Path) -> None:
     made = not home.exists()
     home.mkdir(parents=True, exist_ok=True)
     lock, me = home / LOCK, Process.own()
-    with _serial(home):  # two that see the same lock of an ended process do not both take it
+    with _serial(home):  # two that see the same lock of an ended process do not both replace it
         if lock.exists():
             _check_ended(folder, lock)
             lock.unlink()
@@ -163,7 +163,7 @@ atexit.register(release)
 
 @contextmanager
 def set_aside() -> Iterator[None]:
-    """A block, such as a command, with a folder of its own; at its end the one before is held again."""
+    """A block, such as a command, with a folder of its own; at its end the lock of the one before is restored."""
     global _held
     outer, _held = _held, None
     if outer is not None:
@@ -181,7 +181,7 @@ def set_aside() -> Iterator[None]:
 def locked(comm: MPI.Intracomm, folder: Path) -> Iterator[None]:
     """Lock a folder during a block, unless the running command has locked it or one above it. Collective.
 
-    Raises SceneError: another process holds it.
+    Raises SceneError: another process has locked it.
     """
     if _held is not None and folder.resolve().is_relative_to(_held.folder):
         yield

@@ -19,23 +19,38 @@ from softgrasp.fem.errors import meet
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 SAME = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
-FEW_COLUMNS = 2  # up to which setting up a product of matrices costs more than it saves
+FEW_COLUMNS = 2  # up to which setting up a product of matrices needs more time than it saves
 BLOCK_COLUMNS = 8  # at least so many of a block
 FEW_ENTRIES = 524_288  # of eight columns and more, up to which SciPy's product is the faster one
-BLOCK_ENTRIES = 131_072  # about so many of a block of columns: room that the C library need not ask the system for
+BLOCK_ENTRIES = 131_072  # about so many of a block of columns: memory that the C library has at hand
 
 
 @contextmanager
 def petsc_options(prefix: str, entries: dict[str, object]) -> Iterator[None]:
-    """Set prefixed options for a ``setFromOptions`` call and remove them again: the database is global."""
+    """Set prefixed options but those of the user, and remove them again: the database is global.
+
+    Options of a factor are read at its set-up, so that belongs into the block.
+    """
     database = PETSc.Options(prefix)
-    for key, value in entries.items():
+    ours = {key: value for key, value in entries.items() if not database.hasName(key)}
+    for key, value in ours.items():
         database[key] = value
     try:
         yield
     finally:
-        for key in entries:
+        for key in ours:
             database.delValue(key)
+
+
+def user_options(prefix: str = "softgrasp_") -> list[str]:
+    """Names of the PETSc options that the user gave for a prefix, without the leading dash."""
+    return [name for name in PETSc.Options().getAll() if name.startswith(prefix)]
+
+
+def from_options(solver: Any) -> None:
+    """Let the user's options for the prefix of a solver (KSP, EPS, SVD) win; nothing without any. Collective."""
+    if user_options(solver.getOptionsPrefix()):
+        solver.setFromOptions()
 
 
 def total(comm: MPI.Intracomm, local: Array) -> Array:
@@ -99,7 +114,7 @@ def times_columns(A: PETSc.Mat, X: Array) -> Array:
     """A X for local rows of dense columns, (n_local, k), in the storage of the faster way. Collective.
 
     On one rank X stored by rows, or of eight columns and more with few entries, goes by SciPy's product, for which the
-    matrix keeps a copy, and other X by PETSc's in blocks; on more ranks all columns go at once, since every block costs
+    matrix keeps a copy, and other X by PETSc's in blocks; on more ranks all columns go at once, since every block needs
     messages. One or two columns, and a rank without rows, on which PETSc's product crashes, go by the product with
     vectors. Times of the ways: docs/benchmarks.md.
     """

@@ -19,12 +19,12 @@ from softgrasp.fem.errors import SoftgraspError, SolverError
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.shown import Card, Shown, drawn, listed
 
-STEPS = 8  # in one product: more would not gain at N = 30, where a product costs as much as the call
+STEPS = 8  # in one product: more would not gain at N = 30, where a product needs the time of the call
 BLOCK_ENTRIES = 32_768  # of the matrix of several steps: 256 kB stay in a core's own cache
 
 
 class ReducedSystemError(SoftgraspError):
-    """A reduced system is asked for what it does not hold."""
+    """A reduced system has not what a call needs, or has no unique solution."""
 
 
 def midpoint_map(E: Array, A: Array, loads: Array, dt: float) -> Array:
@@ -42,7 +42,7 @@ def midpoint_map(E: Array, A: Array, loads: Array, dt: float) -> Array:
     try:
         return np.linalg.solve(E - dt / 2 * A, np.concatenate([E + dt / 2 * A, dt * loads], axis=-1))
     except np.linalg.LinAlgError as error:
-        raise SolverError(f"E - dt/2 A is singular at dt = {dt:g} s; take another step") from error
+        raise SolverError(f"E - dt/2 A is singular at dt = {dt:g} s; use another step") from error
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,9 @@ class MidpointSteps:
     """Midpoint steps of E w' = A w + loads [u; 1], several in one product."""
 
     dt: float  # step [s]
-    E: Array  # matrix of the rates, (n, n)
-    A: Array  # matrix of the states, (n, n)
-    loads: Array  # inputs and the constant load, (n, m + 1)
+    E: Array  # matrix of the rates, (k, k)
+    A: Array  # matrix of the states, (k, k)
+    loads: Array  # matrix of the inputs and the constant load, (k, m + 1)
 
     @property
     def size(self) -> int:
@@ -61,7 +61,7 @@ class MidpointSteps:
 
     @property
     def steps(self) -> int:
-        """Steps b in one product with ``block``."""
+        """Number of steps b in one product with ``block``."""
         return int(np.clip(BLOCK_ENTRIES // max(self.size, 1) ** 2, 1, STEPS))
 
     @cached_property
@@ -135,10 +135,14 @@ def march_together(steps: Sequence[MidpointSteps], inputs: Array, start: Array) 
 class StateSpace(Shown):
     """E x' = A x + B u, y = C x, dense, of dimension N."""
 
-    E: Array  # matrix of the rates, regular, (N, N)
-    A: Array  # matrix of the states, (N, N)
-    B: Array  # matrix of the inputs, (N, m); of force and torque on the hand m = n_s
-    C: Array  # matrix of the outputs, (p, N)
+    E: Array
+    """Matrix of the rates, regular, (N, N)."""
+    A: Array
+    """Matrix of the states, (N, N)."""
+    B: Array
+    """Matrix of the inputs, (N, m); of force and torque on the hand m = n_s."""
+    C: Array
+    """Matrix of the outputs, (p, N)."""
 
     @property
     def N(self) -> int:
@@ -160,10 +164,14 @@ class ReducedSystem(StateSpace):
     (('force_x [N]', 'force_y [N]'), (1, 2, 2))
     """
 
-    f: Array  # constant load of gravity, (N,)
-    S_q: Array  # displacement of the hand, (n_s, N)
-    S_v: Array  # velocity of the hand, (n_s, N)
-    names: tuple[str, ...] = ()  # names of the outputs, "tip_x"; y_1.. where their number does not fit
+    f: Array
+    """Constant load of gravity, (N,)."""
+    S_q: Array
+    """Displacement of the hand, (n_s, N)."""
+    S_v: Array
+    """Velocity of the hand, (n_s, N)."""
+    names: tuple[str, ...] = ()
+    """Names of the outputs, "tip_x"; y_1.. where their number does not fit."""
 
     def card(self) -> Card:
         """Dimension, inputs and outputs."""
@@ -210,7 +218,7 @@ class ReducedSystem(StateSpace):
         return drawn("system_bode", self)
 
     def under(self, K: Array) -> Self:
-        """The closed loop u = K x + r with the extra load r as input. python-control's own functions take -K.
+        """The closed loop u = K x + r with the extra load r as input. python-control's own functions use -K.
 
         Raises ReducedSystemError: K (n_s, N) does not fit, or is not finite.
         """
@@ -231,7 +239,7 @@ class ReducedSystem(StateSpace):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs with their units, "force_x [N]"."""
+        """Names of the inputs with their units, "force_x [N]", (n_s,)."""
         return tuple(f"{'torque' if c.rotation else 'force'}_{c.axis} [{c.load_unit}]" for c in self._hand)
 
     @property
@@ -258,7 +266,7 @@ class ReducedSystem(StateSpace):
         except ImportError as error:
             raise ReducedSystemError("python-control is not installed; `pip install control` brings it") from error
         A, B = np.split(np.linalg.solve(self.E, np.hstack([self.A, self.B])), [self.N], axis=1)
-        # python-control may drop states that it thinks uncontrollable, and its names hold no dots
+        # python-control may drop states that it thinks uncontrollable, and its names have no dots
         names = {
             key: [name.replace(".", "_") for name in getattr(self, key)] for key in ("states", "inputs", "outputs")
         }

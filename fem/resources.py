@@ -35,6 +35,15 @@ def free_memory() -> int:
     return free
 
 
+def size_text(size: float) -> str:
+    """A number of bytes with its unit."""
+    for unit in ("byte", "KiB", "MiB", "GiB"):
+        if size < 1000:
+            return f"{size:.3g} {unit}"
+        size /= 1024
+    return f"{size:.3g} TiB"
+
+
 def _entry(table: Path, key: str) -> int:
     """The number behind a word in a table of lines "word number"; 0 without one."""
     try:
@@ -68,7 +77,7 @@ def check_room(comm: MPI.Intracomm, files: Sequence[Path], needed: int, reserve:
 
 
 def reserve_room(path: Path, size: int) -> None:
-    """Take room on the disk behind the end of a file: HDF5, which gives back the rest, ends the program without it.
+    """Allocate room on the disk behind the end of a file: HDF5, which gives back the rest, ends the program without it.
 
     Raises OSError: there is none, or the user's quota or the limit of a file's size is reached.
     """

@@ -1,4 +1,4 @@
-"""How an object shows itself: a title and a few named values, as text and as a table in a notebook."""
+"""Display of an object: a title and a few named values, as text and as a table in a notebook."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_LAYERS = 3  # materials that are shown one by one
 
 @dataclass(frozen=True)
 class Card:
-    """What is shown of an object."""
+    """Displayed part of an object."""
 
     title: str  # kind and name of the object
     rows: tuple[tuple[str, str], ...]  # name and value of each line

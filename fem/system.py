@@ -66,7 +66,7 @@ class Damping:
 class BlockSystem(Shown):
     """All operators of one scene, in z = q_e - T q_s, the displacement relative to the hand [SBRH21].
 
-    K_ee = sum over layers of mu K_mu + lambda K_lambda, M_ee = sum of rho M_1; the equations stand at the top of this
+    K_ee = sum over layers of mu K_mu + lambda K_lambda, M_ee = sum of rho M_1; the equations are at the top of this
     module. Matrices are distributed over ``layout.comm``, small arrays are the same on every rank.
     """
 

@@ -31,7 +31,7 @@ Spelling = Method | Literal["newton-adi"]  # as in scenes
 # Exact to rounding, without a start or shifts that could fail, and still as fast as low rank within some tenths of a
 # second; the faster one of the two changes between 92 and 160 states (docs/benchmarks.md).
 DENSE_STATES = 200
-# A complex factorisation a shift: beyond these sizes 70 to 100 of them take more than a quarter of an hour on two ranks
+# A complex factorisation a shift: beyond these sizes 70 to 100 of them need more than a quarter of an hour on two ranks
 # (docs/benchmarks.md), while Galerkin needs about 5.
 LOW_RANK_LIMIT = {1: 800_000, 2: 800_000, 3: 40_000}  # 1: systems without a mesh
 
@@ -50,7 +50,7 @@ def choose(problem: RiccatiProblem, method: Spelling = "auto") -> SolverChoice:
     Newton-ADI by default; RADI where damping couples the modes; Galerkin where complex factorisations no longer fit.
     Layers with different damping couple the modes of the start to those left out, so K_0 has an error of that coupling
     however many modes are kept short of all (residual 1e-4 after one Newton step with 10 to 120 of 286 modes): three
-    steps, where RADI takes the solves of one. Nor is that start known to stabilise.
+    steps, where RADI needs the solves of one. Nor is that start known to stabilise.
 
     Raises SolverError: the name is unknown.
     """
@@ -58,7 +58,7 @@ def choose(problem: RiccatiProblem, method: Spelling = "auto") -> SolverChoice:
     if name not in METHODS:
         raise SolverError(f"the Riccati method {method!r} is unknown; choose one of {', '.join(METHODS)}")
     if name != "auto":
-        return SolverChoice(name, "asked for")
+        return SolverChoice(name, "requested")
     layout, damping = problem.layout, problem.system.damping
     if layout.states <= DENSE_STATES:
         return SolverChoice("dense", f"{layout.states} states <= {DENSE_STATES}: all modes, exact to rounding")
@@ -83,7 +83,7 @@ def make_solver(
 
     Args:
         method: any but auto.
-        tol: true relative residual (gain change for galerkin); None takes the method's own.
+        tol: true relative residual (gain change for galerkin); None: the method's own.
         progress: observer of the iteration; dense has none.
         checkpoint: folder for restart files; newton_adi only.
     """
@@ -121,7 +121,7 @@ def solve(
     Raises:
         ControlError: weights or data are refused, or some mode cannot be stabilised.
         SolverError: not converged, or the true residual misses the tolerance.
-        ResourceError: dense was asked for at a size that would not fit, or the factor of a shift does not fit.
+        ResourceError: dense was requested at a size that would not fit, or the factor of a shift does not fit.
 
     >>> import softgrasp as sg
     >>> problem = sg.problem(sg.build("paper_lqr", ["tissue.cells=[2, 4]"]))
@@ -130,7 +130,7 @@ def solve(
     """
     choice = choose(problem, method)
     if method == "auto" and choice.method == "dense" and problem.layout.states > DenseRiccati().limit:
-        # undamped and too large for the dense method: which modes are lost says more than the memory that is missing
+        # undamped and too large for the dense method: which modes are lost matters more than the memory that is missing
         diagnose(problem).require()
     try:
         solution = make_solver(choice.method, tol, progress, checkpoint).solve(problem)
@@ -151,7 +151,7 @@ def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) ->
 
     Args:
         modes: number of modes in the model.
-        candidates: lowest modes they are taken from; modes that inputs do not reach or outputs do not see are skipped.
+        candidates: lowest modes they are chosen from; modes that inputs do not reach or outputs do not see are skipped.
 
     Returns:
         A solution of rank up to 2 n_s + 2 modes. ``residual`` is the true one of the whole plant: it is large when
@@ -170,7 +170,7 @@ def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) ->
     good = np.flatnonzero(closed_loop_rates(problem, plant).lost == 0)
     if len(good) < modes:
         raise ControlError(
-            f"modal_lqr: only {len(good)} of the lowest {k} modes can be stabilised, {modes} are asked for; ask for at "
+            f"modal_lqr: only {len(good)} of the lowest {k} modes can be stabilised, {modes} are requested; request at "
             f"most {len(good)}"
         )
     pick = good[:modes]

@@ -34,7 +34,7 @@ DAMAGE = (OSError, LookupError, TypeError, ValueError, RuntimeError, AttributeEr
 GROUP = "reconstruction"  # of the rows on the mesh; its checksum is an attribute sha256_reconstruction
 OLD_GROUP = "lift"  # its name in files of earlier versions, which stay readable
 ROWS = 1 << 16  # rows of the reconstruction read at a time: 30 MB for 60 columns
-# what a file says of a model in JSON, beside its materials and the names of its outputs
+# entries of a model in the JSON of its file, beside its materials and the names of its outputs
 LINEAR_KEYS = (
     "name", "N", "coordinates", "frame", "structure", "fixed_solid", "split", "alpha", "in_space", "damped",
     "hand_weight", "two_way", "scene_hash", "origin", "seconds",
@@ -53,9 +53,9 @@ FIELDS = {"tau": "cubature_tolerance", "residual": "cubature_residual", "reach":
 
 
 def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
-    """Write a reduced model to one HDF5 file, atomically. Collective when the model holds a reconstruction.
+    """Write a reduced model to one HDF5 file, atomically. Collective when the model has a reconstruction.
 
-    The file holds the small matrices in full precision, the outputs, and the reconstruction (2 or 3 arrays of n_e x N)
+    The file has the small matrices in full precision, the outputs, and the reconstruction (2 or 3 arrays of n_e x N)
     by the coordinates of its nodes; every rank adds its rows in turn.
 
     >>> import tempfile, softgrasp as sg
@@ -83,7 +83,7 @@ def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
 
 
 def about(model: ReducedModel | StrainModel) -> dict[str, Any]:
-    """What a file says of a model in JSON."""
+    """Description of a model in JSON, for its file."""
     linear = isinstance(model, ReducedModel)
     keys = LINEAR_KEYS if linear else STRAIN_KEYS
     data: dict[str, Any] = {key: getattr(model, FIELDS.get(key, key)) for key in keys}
@@ -255,7 +255,7 @@ def reading(
 
 
 def write_checksums(file: h5py.File) -> None:
-    """Write the hashes of all that a file holds."""
+    """Write the hashes of all arrays of a file."""
     for rows in (False, True):
         file.attrs[_checksum(file, rows)] = _digest(file, rows)
 
@@ -310,7 +310,7 @@ def read_reconstruction(file: h5py.File, layout: BlockLayout) -> Reconstruction:
 
     path, d, group = file.filename, layout.dimension, _group(file)
     if group not in file:
-        raise ModelError(f"{path} holds no basis on the mesh; load it without a layout, or reduce the scene again")
+        raise ModelError(f"{path} has no basis on the mesh; load it without a layout, or reduce the scene again")
     nodes = file[f"{group}/nodes"][()]
     if nodes.shape != (layout.n_e // d, d):
         raise ModelError(

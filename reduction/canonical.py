@@ -53,7 +53,7 @@ def canonical_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Reconstru
     """
     comm, layout = system.layout.comm, system.layout
     k = 2 * layout.n_s if basis.fixed_solid else 0
-    # canonical models take the hand as their input
+    # the hand is the input of canonical models
     if comm.allreduce(float(np.abs(basis.V_q[:, :k]).sum() + np.abs(basis.V_p[:, :k]).sum())) > 0:
         raise SoftgraspError(f"{basis.name}: the hand's own columns of a canonical basis must be zero in the tissue")
     L_q, _ = relative_rows(basis, system)

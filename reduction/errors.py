@@ -1,7 +1,7 @@
 """Errors of reduced models against the full one: states, deformation, energy, and the projection error of their basis.
 
-Everything that a model shows is linear in Y = [x; q_s; v_s], its state and its hand. With one QR factorisation V = Q R
-of what the largest model of a family shows, and snapshots X = Q C + rest,
+Every view of a model is linear in Y = [x; q_s; v_s], its state and its hand. With one QR factorisation V = Q R
+of the views of the largest model of a family, and snapshots X = Q C + rest,
 
     |X - V Y|_F^2 = |rest|_F^2 + |C - R Y|_F^2
 
@@ -40,10 +40,14 @@ VIEWS: tuple[View, ...] = get_args(View)
 class ModelErrors:
     """Relative errors of a reduced run against snapshots of the full one, dimensionless."""
 
-    error: float  # |X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e] in absolute coordinates: the paper's error [SBRH21]
-    error_canonical: float  # |X - X_r|_F / |X|_F of X = [q_s, p_s, q_e, p_e], from which canonical bases are built
-    error_deformation: float  # |X - X_r|_F / |X|_F of X = [z, v_z], relative to the rigid motion of the hand
-    error_energy: float  # max_t |H_r - H| / max_t H of the tissue's energy relative to the hand
+    error: float
+    """|X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e] in absolute coordinates: the paper's error [SBRH21]."""
+    error_canonical: float
+    """|X - X_r|_F / |X|_F of X = [q_s, p_s, q_e, p_e], from which canonical bases are built."""
+    error_deformation: float
+    """|X - X_r|_F / |X|_F of X = [z, v_z], relative to the rigid motion of the hand."""
+    error_energy: float
+    """Error max_t |H_r - H| / max_t H of the tissue's energy relative to the hand."""
 
 
 def full_energy(system: BlockSystem, Z: Array) -> Array:
@@ -88,7 +92,7 @@ def row_weights(system: BlockSystem) -> tuple[Array, float]:
 def shown_rows(view: View, model: ReducedModel, small: EnergySystem, system: BlockSystem) -> Array:
     """V with V Y = the state of the model for Y = [x; q_s; v_s], local rows, (..., N + 2 n_s). Collective.
 
-    Raises ModelError: the model holds no basis on the mesh.
+    Raises ModelError: the model has no basis on the mesh.
     """
     N, n_s = model.N, small.n_s
     width = N + 2 * n_s
@@ -111,7 +115,7 @@ class Span:
         R = total(self.comm, self.Q.T @ V)
         lost = total(self.comm, np.array([((V - self.Q @ R) ** 2).sum(axis=0), (V**2).sum(axis=0)]))
         if (lost[0] > INSIDE**2 * lost[1]).any():
-            raise ModelError("the model shows more than the one that the errors were prepared for; take the larger one")
+            raise ModelError("the model is larger than the one that the errors were prepared for; use the larger one")
         return R
 
     def error(self, R: Array, Y: Array) -> float:
@@ -163,13 +167,13 @@ class ModelComparison:
     snapshots: Snapshots  # of the full run
     energy: Array  # :func:`full_energy` of the snapshots
     _spans: dict[View, Span] = field(default_factory=dict, repr=False)
-    # what the last model asked about shows, in the span of each view
+    # views of the last model, in the span of each view
     _shown: dict[View, tuple[ReducedModel, Array]] = field(default_factory=dict, repr=False)
 
     def span(self, view: View) -> Span:
-        """Snapshots in what the largest model shows; factored at the first call. Collective.
+        """Snapshots in the span of the largest model's views; factored at the first call. Collective.
 
-        Raises ModelError: the model holds no basis on the mesh.
+        Raises ModelError: the model has no basis on the mesh.
         """
         if view not in self._spans:
             V = shown_rows(view, self.model, self.small, self.system)
@@ -182,9 +186,9 @@ class ModelComparison:
         return ModelComparison(self.model, small, system, snapshots, energy, spans)
 
     def shown(self, view: View, model: ReducedModel, small: EnergySystem) -> Array:
-        """R of :meth:`Span.inside` for what a model shows, kept until another is asked for. Collective.
+        """R of :meth:`Span.inside` for the views of a model, kept until the next model. Collective.
 
-        Raises ModelError: the model shows more than the largest.
+        Raises ModelError: the model is larger than that.
         """
         known, R = self._shown.get(view, (None, np.zeros((0, 0))))
         if known is not model:
@@ -195,7 +199,7 @@ class ModelComparison:
     def state_error(self, view: View, model: ReducedModel, small: EnergySystem, run: ReducedTrajectory) -> float:
         """|X - X_r|_F / |X|_F of a run on the full model's time grid, of the largest model or a smaller. Collective.
 
-        Raises ModelError: the run is shorter than the snapshots, or the model shows more than the largest.
+        Raises ModelError: the run is shorter than the snapshots, or the model has more columns than the largest.
         """
         steps = self.snapshots.steps
         if len(run.x) <= int(steps.max(initial=0)):
@@ -213,7 +217,7 @@ class ModelComparison:
     def projection_error(self, view: View, model: ReducedModel, small: EnergySystem) -> float:
         """min_Y |X - V Y|_F / |X|_F over all states V y, with the hand q_s = S_q y and v_s = S_v y. Collective.
 
-        Raises ModelError: the model shows more than the largest.
+        Raises ModelError: the model is larger than that.
         """
         return self.span(view).projection_error(self.shown(view, model, small) @ with_hand(small))
 

@@ -38,7 +38,7 @@ def unit_coupling(system: BlockSystem) -> tuple[list[Array], list[Array]]:
 def galerkin_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Reconstruction]:
     """Small matrices from which every parameter is assembled, and the reconstruction. Collective.
 
-    The rows of the tissue are tested with V_v itself (the paper), or with V_v - T V_sv where virtual work asks for it:
+    The rows of the tissue are tested with V_v itself (the paper), or with V_v - T V_sv where virtual work requires it:
     two-way coupling, and bases of second order, whose models stay symmetric that way.
     """
     comm = system.layout.comm

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class ReducedModel(Shown):
-    """E x' = A x + B u + F g for all lambda, mu, rho of every layer: a new parameter costs no full-order work.
+    """E x' = A x + B u + F g for all lambda, mu, rho of every layer: a new parameter needs no full-order work.
 
     The matrices are sums over the layers, A = A_0 + sum_l lambda_l A_lambda,l + mu_l A_mu,l and so on, which
     :meth:`at` assembles; a run needs the :class:`EnergySystem` that it returns.
@@ -95,13 +95,16 @@ class ReducedModel(Shown):
         M_ee^-1, which is affine in 1/rho only when all densities change by one factor.
 
         Args:
-            materials: one per layer; None takes those of the projection.
-            gravity: acceleration of free fall (n_s,) [m/s^2]; None takes that of the scene.
+            materials: one per layer; None: those of the projection.
+            gravity: acceleration of free fall (n_s,) [m/s^2]; None: that of the scene.
 
         Raises:
             ModelError: materials that the parts cannot represent.
         """
-        p = self.parameters(self.materials if materials is None else materials, gravity)
+        return self.assemble(self.parameters(self.materials if materials is None else materials, gravity))
+
+    def assemble(self, p: Parameters) -> EnergySystem:
+        """The sums at parameters that need be no material, such as one constant alone. Online; not collective."""
         if self.coordinates == "qv":
             return galerkin_system(self.name, self.parts, p, self.outputs, self.structure == "second_order")
         return canonical_system(self.name, self.parts, p, self.outputs, self.fixed_solid, self.frame == "absolute")
@@ -130,7 +133,7 @@ class ReducedModel(Shown):
             # the common factor enters squared at most: more than rounding apart is another mass distribution
             if max(ratios) - min(ratios) > 1e-12 * scale:
                 raise ModelError(
-                    "a canonical model holds M_ee^-1 and takes densities that all change by one factor; "
+                    "a canonical model contains M_ee^-1 and accepts densities that all change by one factor;  "
                     "project again, or use a (q, v) model"
                 )
         g = self.gravity if gravity is None else np.asarray(gravity, dtype=float)
@@ -142,14 +145,14 @@ class ReducedModel(Shown):
         Args:
             small: the parameter that x was computed at.
             x: reduced states, one a column.
-            v_s: hand velocity (n_s, m); None takes S_v x.
+            v_s: hand velocity (n_s, m); None: S_v x.
 
         Raises:
             ModelError: the model was loaded without its reconstruction.
         """
         reconstruction = self.reconstruction
         if reconstruction is None:
-            raise ModelError("the model holds no basis on the mesh; load it with the layout of its mesh", self.name)
+            raise ModelError("the model has no basis on the mesh; load it with the layout of its mesh", self.name)
         z, v_z = reconstruction.L_q @ x, reconstruction.L_v @ x
         if small.scale != 1.0:
             v_z /= small.scale

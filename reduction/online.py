@@ -25,12 +25,18 @@ TOGETHER = 5_000_000
 class ReducedTrajectory(Shown, Labelled):
     """What a reduced run returns."""
 
-    times: Array  # (steps + 1,) [s]
-    x: Array  # reduced states, (steps + 1, N)
-    q_s: Array  # displacement of the hand, (steps + 1, n_s) [m, rad]
-    v_s: Array  # velocity of the hand, (steps + 1, n_s) [m/s, rad/s]
-    outputs: Array  # y, (steps + 1, p) [m]
-    output_names: tuple[str, ...]  # one per component
+    times: Array
+    """Instants [s], (steps + 1,)."""
+    x: Array
+    """Reduced state at every instant, (steps + 1, N)."""
+    q_s: Array
+    """Displacement of the hand [m, rad], (steps + 1, n_s)."""
+    v_s: Array
+    """Velocity of the hand [m/s, rad/s], (steps + 1, n_s)."""
+    outputs: Array
+    """Outputs y [m, rad], (steps + 1, p)."""
+    output_names: tuple[str, ...]
+    """Name of every output, (p,)."""
 
     def card(self) -> Card:
         """Steps, dimension and outputs."""
@@ -75,7 +81,7 @@ def run(
 ) -> ReducedTrajectory:
     """Midpoint steps E (x_1 - x_0) / dt = A (x_0 + x_1) / 2 + B u + f of a small model. Online; not collective.
 
-    They equal the full model's steps [HLW06], so that structure and errors carry over; many are taken in one product.
+    They equal the full model's steps [HLW06], so that structure and errors carry over; many steps are one product.
 
     Args:
         model: small model, or a propagator made beforehand.

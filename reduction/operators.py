@@ -1,4 +1,4 @@
-"""What projections share: products with every layer, the reconstruction, and what online assembly takes and gives."""
+"""What projections share: products with every layer, the reconstruction, input and result of online assembly."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Basis
 
 Parts = dict[str, Array]
-"""Named small matrices; those with a leading axis hold one matrix a layer."""
+"""Named small matrices; those with a leading axis have one matrix a layer."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from softgrasp.fem.errors import shortened
 from softgrasp.reduction.system import ModelError
 
 Origin = Mapping[str, Any]
-"""Value of every key that decides on a run, a file by the hash of what it holds; nothing that is off or at rest."""
+"""Value of every key that decides on a run, a file by its hash; nothing that is switched off or at rest."""
 
 # of no effect on a run beyond the tolerance of its solver
 FREE = re.compile(
@@ -27,10 +27,10 @@ MATERIAL = re.compile(r"tissue\.(layers\.[^.]+\.)?material\b|tissue\.layers\.[^.
 MOTION = re.compile(r"(motion|time)\b")
 BEFORE, AFTER = 20, 30  # letters before and after the first that differs between two long values
 UNKNOWN = (
-    "does not hold what it was built from (it is of an earlier version), so its gravity, contact, mesh and outputs are "
+    "does not name its scene (it is of an earlier version), so its gravity, contact, mesh and outputs are "
     "not compared with those of the scene; reduce the scene again"
 )
-"""What is said of a model without origin."""
+"""Warning about a model without origin."""
 
 
 def origin_of(keys: Mapping[str, Any]) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def origin_of(keys: Mapping[str, Any]) -> dict[str, Any]:
     if not keys.get("effects.damping.alpha"):
         keys.pop("effects.damping.drag", None)
     keys.setdefault("time.end", keys["motion.duration"])
-    # false, 0 and [] say that an effect is off, or that there is none
+    # false, 0 and [] mean that an effect is switched off, or that there is none
     return {key: value for key, value in keys.items() if value not in (False, 0, [])}
 
 
@@ -51,7 +51,7 @@ def differing(own: Origin, other: Origin, free: tuple[re.Pattern[str], ...]) -> 
         if own.get(key) != other.get(key) and not any(pattern.match(key) for pattern in free):
             texts = [_text(key, where[key]) if key in where else "" for where in (own, other)]
             same = next((i for i, (a, b) in enumerate(zip(*texts, strict=False)) if a != b), 0)
-            if same > BEFORE and max(map(len, texts)) > BEFORE + AFTER:  # what differs must be within what is shown
+            if same > BEFORE and max(map(len, texts)) > BEFORE + AFTER:  # what differs must be within the quoted part
                 texts = [f"...{text[same - BEFORE :]}" for text in texts]
             mine, its = map(shortened, texts)
             return f"{f'with {key} = {mine}' if mine else f'without {key}'}, and the scene has {its or 'none'}"
@@ -73,6 +73,6 @@ def check_origin(origin: Origin, keys: Mapping[str, Any], name: str) -> None:
         warnings.warn(f"{name}: the model {UNKNOWN}", RuntimeWarning, stacklevel=3)
     elif difference := differing(origin, origin_of(keys), (MATERIAL, MOTION)):
         raise ModelError(
-            f"the model was built {difference}; it takes other materials, motions and times only, so reduce that "
+            f"the model was built {difference}; it accepts other materials, motions and times only, so reduce that "
             "scene itself", name,
         )  # fmt: skip

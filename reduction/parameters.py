@@ -33,7 +33,7 @@ def box_of(model: Model) -> tuple[list[float], list[float]]:
 
 
 def outside(model: Model) -> str:
-    """Why the scene's own constants lie outside the box, so that errors there say nothing; empty when inside."""
+    """Why the scene's own constants lie outside the box, so that errors there are not its own; empty when inside."""
     first, box = model.system.materials[0], box_of(model)
     for key, value, (low, high) in zip(("lambda", "mu"), (first.lam, first.mu), box, strict=True):
         if value <= 0:

@@ -34,7 +34,7 @@ def project(
     A basis in (q, v) gives the paper's Galerkin model with W = V [SBRH21] (`reduction.galerkin`), one in (q, p) a
     canonical model that is Hamiltonian, or dissipative with damping [AH19] (`reduction.canonical`).
 
-    A canonical model is affine around the densities of ``system``. Costs a product with every component for each basis
+    A canonical model is affine around the densities of ``system``. Needs a product with every component for each basis
     vector; a canonical model also one factorisation of M_ee and a solve for each vector with a momentum.
 
     Raises:

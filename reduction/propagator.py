@@ -140,7 +140,7 @@ class Propagator(MidpointSteps):
 
     model: EnergySystem  # what it steps
     at: StepCoordinates  # coordinates, x = X w
-    driven: bool = False  # the hand is prescribed: w holds the tissue only, and the inputs are the hand's in a step
+    driven: bool = False  # the hand is prescribed: w has the tissue only, and the inputs are the hand's in a step
     modal: Modal | None = None  # the step mode by mode, for conservative models
 
     @property
@@ -198,8 +198,8 @@ def _whole(model: EnergySystem) -> StepCoordinates | None:
     """Coordinates w = [modes; still; free] of a conservative model with its hand inside, H = |modes, still|^2 / 2.
 
     H is semidefinite: displacements of the free hand cost nothing. With H = y'y / 2, y = R x and y' = R E^-1 A R^+ y, a
-    skew matrix, whose null vectors stand still (a hand that coasts). The null space of H is moved but moves nothing.
-    None when the numbers do not show the structure.
+    skew matrix, whose null vectors are constant (a hand that coasts). The null space of H is moved but moves nothing.
+    None when the numbers do not have the structure.
     """
     H = model.H
     D = np.sqrt(np.abs(np.diag(H)))

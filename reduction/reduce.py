@@ -65,7 +65,7 @@ def reduce(
             "psd_cotangent_lift", "psd_svd_like" and their "_fixed" and "_relative" forms, or "craig_bampton"; all keys
             in :data:`softgrasp.reduction.bases.registry.METHODS`. None is the paper's PSD with fixed solid modes
             "psd_fixed" [SBRH21]; at finite strain there is one basis only, the cotangent lift.
-        N: dimension, the hand's 2 n_s included. Linear models also take a rule, and None, which keeps 99.9 % of the
+        N: dimension, the hand's 2 n_s included. Linear models also accept a rule, and None, which keeps 99.9 % of the
             energy as the paper does.
         inner: inner product of the snapshots, see :func:`softgrasp.reduction.bases.registry.make_basis`; linear only.
         engine: factorisation of the snapshots, see the same function; linear only.

@@ -134,7 +134,7 @@ def replay_inputs(rom: ReducedModel, small: EnergySystem, full: FullRun) -> tupl
 
 
 def nearest_state(rom: ReducedModel, small: EnergySystem, full: FullRun) -> Array:
-    """State x that shows the first snapshot best, min_x |V x - X_0|, (N,). Collective."""
+    """State x that approximates the first snapshot best, min_x |V x - X_0|, (N,). Collective."""
     system, snapshots, first = full.model.system, full.snapshots, slice(0, 1)
     n, Z, q_s, v_s = system.layout.n_local, snapshots.Z[:, first], snapshots.q_s[:, first], snapshots.v_s[:, first]
     V = factor(system.layout.comm, shown_rows("velocities", rom, small, system) @ with_hand(small))

@@ -82,7 +82,7 @@ def skew_modes(S: Array) -> tuple[Array, Array]:
 def spectrum(E: Array, A: Array, Q: Array, conservative: bool) -> Spectrum:
     """Eigenvalues of a block E x' = A x with the energy x' Q x / 2.
 
-    Where the structure proves that nothing grows, a positive real part can only be rounding and is not shown.
+    Where the structure proves that nothing grows, a positive real part can only be rounding and is not reported.
 
     Args:
         E, A: (n, n), E nonsingular.

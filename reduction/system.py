@@ -16,7 +16,7 @@ from softgrasp.reduction.spectrum import Spectrum, spectrum
 
 
 class ModelError(ReductionError):
-    """A reduced model cannot be made, or is asked for what it does not hold."""
+    """A reduced model cannot be made, or lacks what a call needs."""
 
 
 class UnstableModelError(SoftgraspError):
@@ -48,13 +48,20 @@ class EnergySystem(ReducedSystem):
     its first 2 n_s entries are q_s [m, rad] and v_s [m/s, rad/s].
     """
 
-    name: str  # name of the basis
-    C_s: Array  # outputs of the rigid motion, the part C_s q_s of y, (p, n_s)
-    H_tissue: Array  # matrix of the tissue's energy (z' K z + v_z' M v_z) / 2 [J], (N, N)
-    H: Array  # H_tissue with the hand's kinetic energy; two-way of the rigid motion too: the Hamiltonian [J], (N, N)
-    two_way: bool  # whether the hand feels the tissue
-    structured: bool  # whether the model conserves its energy by construction where nothing damps
-    scale: float = 1.0  # density over that of the projection (canonical models, else 1)
+    name: str
+    """Name of the basis."""
+    C_s: Array
+    """Outputs of the rigid motion, the part C_s q_s of y, (p, n_s)."""
+    H_tissue: Array
+    """Matrix of the tissue's energy (z' K z + v_z' M v_z) / 2 [J], (N, N)."""
+    H: Array
+    """H_tissue with the hand's kinetic energy; two-way of the rigid motion too: the Hamiltonian [J], (N, N)."""
+    two_way: bool
+    """Whether the hand feels the tissue."""
+    structured: bool
+    """Whether the model conserves its energy by construction where nothing damps."""
+    scale: float = 1.0
+    """Density over that of the projection (canonical models, else 1)."""
 
     def card(self) -> Card:
         """Dimension, stability and outputs."""
@@ -100,7 +107,7 @@ class EnergySystem(ReducedSystem):
             raise ModelError("the reduced matrices are not finite; check basis and materials", self.name)
         if singular(self.E):
             raise ModelError(
-                "the reduced E is singular; its basis vectors are linearly dependent, take fewer", self.name
+                "the reduced E is singular; its basis vectors are linearly dependent, use fewer", self.name
             )
 
     @property
@@ -138,6 +145,6 @@ class EnergySystem(ReducedSystem):
         if self.f.any():
             A = self.A[k:, k:]
             if singular(A):  # as with more displacements than velocities in the basis
-                raise ModelError("the basis has no single equilibrium under gravity; take another N", self.name)
+                raise ModelError("the basis has no single equilibrium under gravity; use another N", self.name)
             x[k:] = -np.linalg.solve(A, self.f[k:])
         return x

@@ -37,6 +37,7 @@ OUTSIDE = {"benchmarks": bench_app, "tests.hardcases": hardcases_app}
 DRAWS = ("simulate", "sweep", "reduce", "control")
 LONG = ("study", "effects")  # run as they stand, with -m slow
 ELSEWHERE = {  # what no test here can run, or what another one does
+    r"make -C out/\w+ .*": "tests/reduction/export/test_plant.py",
     r"make \w+": "test_make_targets_of_the_pages_exist; .ci/run",
     r"apt install .*|conda env .*|docker .*": "they need a network and rights",
     r"(python3 -m venv|\.venv/bin/pip|env/bin/pip) .*": "tests/test_project.py installs the wheel",

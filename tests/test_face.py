@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import ast
 import doctest
+import importlib
 import inspect
 import re
 import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
 import pytest
 
 import softgrasp as sg
+from softgrasp._face import names_of
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.lqr.design.feedback import Design
+from softgrasp.fem.shown import Shown
 from softgrasp.lqr.loop.full import LoopTrajectory
-from softgrasp.lqr.plant.problem import RiccatiSolution
+from softgrasp.reduction.errors import ModelErrors
 from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.strain.model import StrainModel, StrainRun
+from softgrasp.reduction.strain.training import StrainErrors
+from softgrasp.reduction.system import EnergySystem
 
 pytestmark = pytest.mark.serial
 ROOT = Path(__file__).parents[1]
@@ -54,7 +60,34 @@ def undocumented(source: str) -> list[str]:
     return [name for name, documented in fields if not documented and not name.startswith("_")]
 
 
-DOCUMENTED = [sg.Scene, sg.Model, Trajectory, sg.Controller, ReducedModel, LoopTrajectory, Design, RiccatiSolution]
+# Classes that modules import for their annotations only.
+FOR_TYPES = {c.__name__: c for c in (sg.Scene, sg.Model, Trajectory, StrainModel, StrainRun, StrainErrors)}
+
+
+def returned(value: Any) -> set[type]:
+    """Classes of the package in the annotation of a function's result; a class is its own."""
+    if isinstance(value, type):
+        return {value}
+    value = getattr(value, "fget", None) or getattr(value, "func", None) or value  # properties
+    if not inspect.isfunction(value) or not value.__module__.startswith("softgrasp."):
+        return set()
+    found, left = set(), [get_type_hints(value, localns=FOR_TYPES).get("return")]
+    while left:
+        hint = left.pop()
+        left += get_args(hint)
+        found |= {hint} if isinstance(hint, type) and hint.__module__.startswith("softgrasp.") else set()
+    return found
+
+
+def shown_to_users() -> list[type]:
+    """Classes that the names of the package return, those that their methods return, and the bases of both."""
+    first = {c for name in sg.__all__ for c in returned(getattr(sg, name))}
+    then = {d for c in first for name, value in inspect.getmembers(c) if name[0] != "_" for d in returned(value)}
+    every = {base for c in first | {d for d in then if issubclass(d, Shown)} for base in c.__mro__}
+    return sorted((c for c in every if c.__module__.startswith("softgrasp.")), key=lambda c: c.__name__)
+
+
+DOCUMENTED = shown_to_users()
 """A docstring under each field."""
 
 
@@ -62,6 +95,11 @@ DOCUMENTED = [sg.Scene, sg.Model, Trajectory, sg.Controller, ReducedModel, LoopT
 def test_every_field_has_a_docstring(value: type) -> None:
     assert undocumented(inspect.getsource(value)) == []
     assert undocumented('class A:\n    a: int  # one\n    b: int\n    """Two."""\n    c: int') == ["a", "c"]
+
+
+def test_what_users_get_is_found() -> None:
+    least = {sg.Scene, sg.Model, Trajectory, ReducedModel, StrainModel, StrainRun, ModelErrors, StrainErrors}
+    assert least | {sg.Controller, LoopTrajectory, EnergySystem} <= set(DOCUMENTED)
 
 
 @pytest.mark.parametrize("name", sg.__all__)
@@ -85,3 +123,31 @@ def test_every_docstring_says_what_a_user_needs(name: str) -> None:
             "make_controller",
             "sweep",
         )  # definitions
+
+
+FACES = [
+    f"softgrasp.{name}"
+    for name in ("fem", "reduction", "lqr", *(f"study.{room}" for room in ("report", "pictures", "shell")))
+]
+
+
+@pytest.mark.parametrize("package", FACES)
+def test_a_package_gives_its_names_when_they_are_used(package: str) -> None:
+    """Each is that of its module, and none is called like a module of the package, which an import would put there."""
+    module = importlib.import_module(package)
+    names = names_of(str(module.__file__))
+    assert len(names) > 5
+    assert set(names) <= set(dir(module))
+    for name, at in names.items():
+        origin = importlib.import_module(at)
+        assert getattr(module, name) is getattr(origin, name)
+    folder = Path(str(module.__file__)).parent
+    assert not set(names) & {path.stem for path in folder.iterdir()} - {"style"}
+    with pytest.raises(AttributeError, match=r"no attribute 'Sceen'"):
+        module.Sceen  # noqa: B018
+
+
+def test_a_face_loads_only_what_is_used() -> None:
+    code = "import sys; from softgrasp.fem import Scene; print({'mpi4py.MPI', 'dolfinx'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.strip() == "set()", done.stderr

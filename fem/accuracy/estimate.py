@@ -6,7 +6,7 @@ is the difference of two small models (:mod:`softgrasp.fem.accuracy.krylov`) und
 damping and coupling: one of the mesh itself, one of elements of the next order on the same cells, or of a graded mesh
 where the mesh has no grading of its own. Both share the time step, whose error cancels. The graded mesh of a mesh file
 has its cells, some bisected, and the next order, or it would be no finer away from the ends; that of a box has cells of
-its own, and what it cannot tell from its tolerance is left to the next order.
+its own, and an error too near to its tolerance is left to the next order.
 
 With e_j the differences of static solutions on the finer space and on the mesh, for the loads of the hand's motion (G),
 of the lowest modes (M phi_k) and of the outputs (C'), a cell T owes [BR01]
@@ -222,7 +222,7 @@ def comparison(scene: Scene, tolerance: float) -> Scene:
 
 
 def zone_shift(model: Model) -> float:
-    """Largest distance of the ends of the zone held from the faces of ``contact.box`` inside the body [m]. Collective.
+    """Largest distance of the contact zone's ends from the faces of ``contact.box`` inside the body [m]. Collective.
 
     Facets count by their midpoints, so that a zone may end half a cell beyond or short of the box.
     """
@@ -244,8 +244,8 @@ def zone_shift(model: Model) -> float:
 
 INSTANTS = 100
 DIGITS = 7  # of the largest eta_T that count: solves carry more, and cells that mirror each other stay together
-GAIN = 1.2  # eta_T of the marked cells over what bisection takes away: it splits their neighbours too
-LEAST, LARGEST = 0.15, 0.8  # share of the sum of eta_T that the marked cells hold [D96]
+GAIN = 1.2  # eta_T of the marked cells over what bisection removes of it: it splits their neighbours too
+LEAST, LARGEST = 0.15, 0.8  # share of the marked cells in the sum of eta_T [D96]
 
 
 def marked_cells(small: KrylovModel, finer: KrylovModel, factor: float) -> npt.NDArray[np.int32] | None:

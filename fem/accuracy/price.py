@@ -1,7 +1,7 @@
-"""What runs and estimates cost, counted from their sizes: the same on every machine and under every load.
+"""Work of runs and estimates, counted from their sizes: the same on every machine and under every load.
 
 Seconds of one core of the machine where the constants were measured (2D: triangles, 3D: tetrahedra of boxes); a factor
-takes n^1.5 in 2D and n^2 in 3D, a solve with it n log n and n^(4/3), by nested dissection.
+needs n^1.5 in 2D and n^2 in 3D, a solve with it n log n and n^(4/3), by nested dissection.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.run.forecast import forecast
 from softgrasp.fem.solve.costs import BUILD, ENTRIES, Work
 
-SHARE = 0.3  # of a run's work that an estimate may take unasked
+SHARE = 0.3  # of a run's work that an estimate may need without --certify
 PRODUCTS = 4  # with a column of a Krylov model, for its inner products
 STARS = {2: 3e-5, 3: 1.2e-4, 4: 4e-4}  # [s] an unknown to set up stars, by order
 STARS_ENTRY = 6.5e-9  # [s] of an entry in an iteration with them
@@ -35,7 +35,7 @@ def run_seconds(model: Model) -> float:
 
 @dataclass(frozen=True)
 class Plan:
-    """One way to estimate the error of a mesh, as :func:`softgrasp.fem.accuracy.estimate.estimate` takes it."""
+    """One way to estimate the error of a mesh, an argument of :func:`softgrasp.fem.accuracy.estimate.estimate`."""
 
     seconds: float  # what it takes
     surplus: bool = False  # iterations on the next order instead of solves

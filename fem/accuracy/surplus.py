@@ -1,4 +1,4 @@
-"""The model of the next order corrected instead of solved, for meshes where its factor would take too long.
+"""The model of the next order corrected instead of solved, for meshes where its factor would need too much time.
 
     e = K'^-1 (f' - K' I u_h)
 

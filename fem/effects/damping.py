@@ -48,7 +48,7 @@ class DampingEffect(Effect):
         return ("D_ee",) if layered(scene) else ()
 
     def gate(self, problem: Problem) -> Gate:
-        """Damping ratio of the first mode against one that takes 5 % of its amplitude in the run.
+        """Damping ratio of the first mode against one that damps its amplitude by 5 % in the run.
 
         A mode decays as exp(-zeta omega t).
         """

@@ -23,13 +23,13 @@ class Gradient:
 
     @property
     def linear(self) -> bool:
-        """Whether linear elasticity holds: only a small share of the volume is steep."""
+        """Whether linear elasticity is valid: only a small share of the volume is steep."""
         return self.share <= SMALL_SHARE
 
 
 @dataclass(frozen=True)
 class Sag:
-    """Static displacement z of K_ee z = G g, the hand held still."""
+    """Static displacement z of K_ee z = G g with the hand at rest."""
 
     # acceleration of gravity (d,) [m/s2]; without gravity in the scene that of the earth, along the last axis
     g: tuple[float, ...]
@@ -39,7 +39,7 @@ class Sag:
 
 @dataclass(frozen=True)
 class Gate:
-    """A dimensionless number that says whether an effect matters."""
+    """A dimensionless number that decides whether an effect matters."""
 
     number: float  # its value, dimensionless
     symbol: str  # how it is computed
@@ -82,7 +82,7 @@ class Effect(ABC):
 
     name: str  # its key
     term: str  # what it adds to the equation
-    cost: str  # what it costs, one sentence
+    cost: str  # operators and work that it adds, one sentence
     threshold: float  # of its number, where that does not depend on the scene
 
     def active(self, scene: Scene) -> bool:
@@ -95,7 +95,7 @@ class Effect(ABC):
 
     @abstractmethod
     def gate(self, problem: Problem) -> Gate:
-        """The dimensionless number that says whether it matters."""
+        """The dimensionless number that decides whether it matters."""
 
 
 def force_drives(scene: Scene) -> bool:

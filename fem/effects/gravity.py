@@ -8,7 +8,7 @@ from softgrasp.fem.effects.gate import SMALL_SHARE, Effect, Gate, Problem
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 
-EARTH = 9.81  # [m/s2], assumed when the scene leaves gravity off
+EARTH = 9.81  # [m/s2], assumed when the scene has no gravity
 
 
 def acceleration(scene: Scene, n_s: int) -> Array | None:

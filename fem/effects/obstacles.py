@@ -19,7 +19,7 @@ class ObstaclesEffect(Effect):
         return ("columns of S^-1 N'",) if self.active(scene) else ()
 
     def gate(self, problem: Problem) -> Gate:
-        """Number of obstacles; only a run shows whether the tissue gets there."""
+        """Number of obstacles; only a run determines whether the tissue gets there."""
         number = len(problem.scene.obstacle or [])
         sentence = (
             "Off; the scene has no [[obstacle]]."

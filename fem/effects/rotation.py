@@ -42,7 +42,7 @@ class RotationEffect(Effect):
     def gate(self, problem: Problem) -> Gate:
         """Inertia of the rigid tissue about the reference over that of the hand, worst axis.
 
-        A hand of unknown inertia is taken to have the tissue's radius of gyration.
+        A hand of unknown inertia is assumed to have the tissue's radius of gyration.
         """
         scene, d = problem.scene, problem.dimension
         hand = hand_inertia(scene, d)
@@ -59,7 +59,7 @@ class RotationEffect(Effect):
             sentence = (
                 "Off, though the tissue pulls on a hand that a force drives and would turn it."
                 if matters and reaction
-                else "Off; with the reaction, which this scene calls for too, the tissue would turn the hand."
+                else "Off; with the reaction, which this scene needs too, the tissue would turn the hand."
                 if matters
                 else "Off; nothing in this scene turns the hand."
                 if not reaction

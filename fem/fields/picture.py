@@ -32,7 +32,7 @@ class PictureMesh:
     names: tuple[str, ...]  # name of each layer
     reference: Array  # point the hand turns about [m], shape (d,)
     n_s: int  # number of degrees of freedom of the hand [1]
-    obstacles: tuple[Obstacle, ...] = ()  # what the tissue may touch and does not move
+    obstacles: tuple[Obstacle, ...] = ()  # what the tissue may touch
 
     @property
     def dimension(self) -> int:
@@ -70,12 +70,14 @@ def gather_picture(model: Model) -> PictureMesh | None:
     if not whole:
         return None
     points, cells, facets, contact, layers = whole
-    fixed: tuple[Obstacle, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
     if model.scene.effects.obstacles:
         from softgrasp.fem.obstacles import make_obstacles  # only such scenes pay for it
 
-        fixed = tuple(o for o in make_obstacles(model.scene, layout.dimension) if o.path is None)
-    return PictureMesh(points, cells, facets, contact, layers, model.space.layers, layout.reference, layout.n_s, fixed)
+        obstacles = make_obstacles(model.scene, layout.dimension)
+    return PictureMesh(
+        points, cells, facets, contact, layers, model.space.layers, layout.reference, layout.n_s, obstacles
+    )
 
 
 def vertex_displacement(model: Model, z: Array, q_s: Array) -> Array | None:
@@ -90,24 +92,28 @@ def vertex_displacement(model: Model, z: Array, q_s: Array) -> Array | None:
     Returns:
         Shape (n, d), or (k, n, d) for k instants.
     """
-    d, space = model.space.layout.dimension, model.space
+    columns = z[:, None] if z.ndim == 1 else z  # a rank may own no row
+    hands = np.asarray(q_s, dtype=np.float64).reshape(len(q_s), -1)
+    d = model.space.layout.dimension
+    fields = [model.displacement(columns[:, j], hands[:, j]).x.array.reshape(-1, d) for j in range(columns.shape[1])]
+    rows = vertex_values(model, np.hstack(fields))
+    if rows is None or z.ndim == 1:
+        return rows
+    return np.ascontiguousarray(rows.reshape(len(rows), -1, d).transpose(1, 0, 2))
+
+
+def vertex_values(model: Model, values: Array) -> Array | None:
+    """Rows of the vertices from those of the local nodes (m, k) of the elements, on rank 0, (n, k); None elsewhere.
+
+    Collective.
+    """
+    space = model.space
     geometry, dofmap = space.mesh.mesh.geometry, space.V.dofmap
-    owned = geometry.index_map().size_local
     # The first d + 1 dofs of a Lagrange cell sit on its vertices, in the order of the geometry; a vertex may belong
     # to another rank as dof than as mesh node, so ghosts count too.
     node_dof = np.zeros(len(geometry.x), dtype=np.int64)
-    node_dof[cell_nodes(space.mesh.mesh)] = dofmap.list[:, : d + 1]
-    dofs = node_dof[:owned]
-    columns = z[:, None] if z.ndim == 1 else z  # a rank may own no row
-    hands = np.asarray(q_s, dtype=np.float64).reshape(len(q_s), -1)
-    local = np.empty((owned, columns.shape[1] * d))
-    for j in range(columns.shape[1]):
-        values = model.displacement(columns[:, j], hands[:, j]).x.array.reshape(-1, d)
-        local[:, j * d : (j + 1) * d] = values[dofs]
-    gathered = rows_on_root(space.layout.comm, local)
-    if gathered is None or z.ndim == 1:
-        return gathered
-    return np.ascontiguousarray(gathered.reshape(len(gathered), -1, d).transpose(1, 0, 2))
+    node_dof[cell_nodes(space.mesh.mesh)] = dofmap.list[:, : space.mesh.dimension + 1]
+    return rows_on_root(space.layout.comm, values[node_dof[: geometry.index_map().size_local]])
 
 
 def _outward(mesh: Any, d: int, facets: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:

@@ -1,6 +1,6 @@
 """The displacement at points of the body that need not be nodes, y(p) = R(p) q_s + sum_i phi_i(p) z_i.
 
-phi_i are the shape functions of the cell that holds p, so that y(p) is the same quantity on every mesh.
+phi_i are the shape functions of the cell that contains p, so that y(p) is the same quantity on every mesh.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def make_probe(space: Discretisation, places: Sequence[Array], rotation: bool) -
 
 
 def locate(space: Discretisation, points: Array) -> tuple[np.ndarray, Array, Array]:
-    """Global nodes of the cells that hold points (k, d), their shape functions there, and the places. Collective.
+    """Global nodes of the cells that contain points (k, d), their shape functions there, and the places. Collective.
 
     A point outside the body moves to the nearest point of the body.
 
@@ -79,7 +79,7 @@ def locate(space: Discretisation, points: Array) -> tuple[np.ndarray, Array, Arr
     distance = np.full(len(points), np.inf)
     if (cells >= 0).all():
         distance = dolfinx.geometry.squared_distance(mesh, space.mesh.dimension, cells, padded)
-    # the first rank of those as near as rounding tells: a point between two parts belongs to both
+    # the first rank of those equally near to rounding: a point between two parts belongs to both
     distances = np.array(comm.allgather(distance))
     roots = np.argmax(distances <= distances.min(axis=0) + (1e-12 * space.layout.extent) ** 2, axis=0)
     local = {k: _shapes(space, cells[k], padded[k]) for k in range(len(points)) if roots[k] == comm.rank}

@@ -21,9 +21,10 @@ KINDS = {(2, 1): 5, (2, 2): 22, (2, 3): 69, (3, 1): 10, (3, 2): 24, (3, 3): 71} 
 class SeriesWriter:
     """Fields against time in ``NAME.pvd``, with a file an instant in the folder ``NAME``.
 
-    Each holds at the nodes ``displacement`` [m], ``velocity`` [m/s] and ``held`` (1 where the hand holds the tissue);
-    in the cells ``strain`` [1], ``stress`` and ``von_mises`` [Pa] and ``layer``; and ``hand`` [m, rad], the hand's
-    displacement. Cells keep the order of the elements.
+    Each has at the nodes ``displacement`` [m], ``velocity`` [m/s], ``held`` (1 on the contact zone), with obstacles
+    ``contact_traction`` [Pa], their force over area in the last step; in the cells ``strain`` [1], ``stress``
+    and ``von_mises`` [Pa] and ``layer``; and ``hand`` [m, rad], the hand's displacement. Cells keep the order of the
+    elements.
 
     Collective. Raises OSError: the directory cannot be made.
     """
@@ -56,7 +57,17 @@ class SeriesWriter:
         """Choose another stem of the files, and the run's name, before the first write."""
         self.file, self.folder, self.run = self.directory / f"{name}.pvd", self.directory / name, run
 
-    def write(self, t: float, z: Array, v: Array, q_s: Array, v_s: Array | None = None, *, reserve: int = 0) -> None:
+    def write(
+        self,
+        t: float,
+        z: Array,
+        v: Array,
+        q_s: Array,
+        v_s: Array | None = None,
+        *,
+        traction: Array | None = None,
+        reserve: int = 0,
+    ) -> None:
         """Append one instant. Collective.
 
         Args:
@@ -64,6 +75,7 @@ class SeriesWriter:
             z, v: relative displacement [m] and velocity [m/s] on the owned free dofs, shape (n_local,).
             q_s: hand, shape (n_s,) [m, rad].
             v_s: its velocity, shape (n_s,) [m/s, rad/s]; without it no velocity is written.
+            traction: of contact at the local nodes, shape (nodes, d) [Pa]; without it none is written.
             reserve: bytes that must stay free on the disk.
 
         Raises:
@@ -71,9 +83,11 @@ class SeriesWriter:
             OSError: the files cannot be written.
         """
         points, cells = self._fields(z, v, q_s, v_s)
+        if traction is not None:
+            points.append(Field("contact_traction", "Pa", self._points(traction)))
         whole = [Field("TimeValue", "s", np.array([t])), Field("hand", "m", np.asarray(q_s, dtype=np.float64))]
         fields = [*points, *cells, *(field for part in self.grid.fields().values() for field in part)]
-        needed = self.comm.reduce(sum(field.values.nbytes for field in fields)) or 0  # one file, so rank 0 asks for all
+        needed = self.comm.reduce(sum(field.values.nbytes for field in fields)) or 0  # one file, by rank 0
         if self.written == 0:
             on_root(self.comm, self._begin)
         path = self.folder / f"{self.written:06}.vtu"

@@ -1,6 +1,6 @@
 """Unstructured grids of VTK, one binary file for all ranks, and the list of such files against time (``.pvd``).
 
-ParaView, PyVista, VisIt and meshio read them; the numbers stand behind the XML, each array after its length in bytes.
+ParaView, PyVista, VisIt and meshio read them; the numbers follow the XML, each array after its length in bytes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TENSOR = ("xx", "yy", "zz", "xy", "yz", "xz")  # the order of a symmetric tensor
 class Field:
     """One array of a grid."""
 
-    name: str  # as ParaView shows it; empty where the place in the file says it
+    name: str  # as ParaView displays it; empty where the place in the file determines it
     unit: str  # as "m/s"
     values: npt.NDArray[np.generic]  # shape (n,) or (n, components)
 
@@ -58,7 +58,7 @@ class Grid:
     kind: int  # VTK's number of the kind of cell
 
     def fields(self) -> dict[str, list[Field]]:
-        """Points and cells as arrays of the file, by the XML element that holds them."""
+        """Points and cells as arrays of the file, by the XML element that contains them."""
         m, k = self.cells.shape
         return {
             "Points": [Field("points", "m", self.points)],

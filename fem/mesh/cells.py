@@ -1,6 +1,6 @@
 """Cells of any type meshio names, cut into linear lines, triangles or tetrahedra (numpy only, not collective).
 
-``points`` are those of the whole mesh (n_points, 2 or 3) [m], ``cells`` corner nodes (n_cells, corners) unless said
+``points`` are those of the whole mesh (n_points, 2 or 3) [m], ``cells`` corner nodes (n_cells, corners) unless stated
 otherwise, ``shape`` is that of :func:`shape_of`, and ``name`` that of the mesh, for messages.
 """
 

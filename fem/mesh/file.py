@@ -1,4 +1,4 @@
-"""Mesh files of any format meshio reads: taken apart and checked on rank 0, then distributed."""
+"""Mesh files of any format meshio reads: parsed and checked on rank 0, then distributed."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def read_mesh(
     """Read a mesh and cut its cells into linear triangles or tetrahedra, with its facet and cell tags.
 
     Quadrilaterals, hexahedra, wedges and pyramids are cut as in `fem.mesh.cells.simplices`, cells of higher order with
-    straight edges are taken by their corners. Cells of the highest dimension make the body, those one
+    straight edges are reduced to their corners. Cells of the highest dimension make the body, those one
     dimension lower carry the facet tags.
 
     Collective. Rank 0 reads and checks.
@@ -70,7 +70,7 @@ def read_mesh(
         seam: boundary nodes closer than this share of the shortest edge there count as doubled [1].
         limit: longest processor time for a file that meshio may never end [s]; by its size if None.
 
-    Raises MeshError: the file is missing or unreadable, takes longer than the limit, holds polygons, polyhedra or
+    Raises MeshError: the file is missing or unreadable, needs longer than the limit, has polygons, polyhedra or
     curved cells, a mesh of surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted.
     """
     arrays: MeshArrays | None = None
@@ -90,7 +90,7 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limi
     if None in shapes or dimension < 2:
         raise MeshError(
             f"{path} holds cells of type {', '.join(kinds) or 'none'}: only triangles, quadrilaterals, tetrahedra, "
-            "hexahedra, wedges and pyramids are taken, export the mesh with these."
+            "hexahedra, wedges and pyramids are accepted, export the mesh with these."
         )
     for block in raw.cells:
         if block.data.size and not 0 <= block.data.min() <= block.data.max() < len(raw.points):
@@ -142,7 +142,8 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limi
 def _read(path: Path, limit: float | None) -> meshio.Mesh:
     try:
         if not path.is_file():
-            raise MeshError(f"The mesh file {path} does not exist: tissue.mesh is taken relative to the scene file.")
+            given = " ('given' is a mesh that a program passes to softgrasp.build)" if path.name == "given" else ""
+            raise MeshError(f"The mesh file {path} does not exist: tissue.mesh is relative to the scene file{given}.")
         return read_foreign(path, limit)
     except TimeoutError as error:
         raise MeshError(
@@ -225,7 +226,7 @@ def _placed(part: npt.NDArray[np.integer], place: dict[int, int]) -> Integers:
 def _named(
     raw: meshio.Mesh, blocks: list[tuple[int, str, Integers]], cut: list[tuple[Integers, Integers]]
 ) -> dict[str, Flags]:
-    """Which simplices each named set of the file holds, without the sets that hold none.
+    """Simplices of each named set of the file, without empty sets.
 
     A set must have one list of cells a block; others (sets of sets) are left out, and so are unknown names then.
     """

@@ -22,7 +22,7 @@ import meshio
 _SAFE = {".inp": "abaqus", ".mesh": "medit", ".vtk": "vtk", ".vtu": "vtu", ".xdmf": "xdmf", ".xmf": "xdmf"}
 _GMSH = b"$MeshFormat"  # .msh is a suffix of Ansys too
 _LAUNCHERS = ("PMI", "MPI", "OMPI", "HYDRA", "HYDI", "I_MPI", "SLURM")  # an HDF5 with MPI would join the running job
-LEAST, PER_BYTE = 10.0, 1e-6  # [s, s/byte]: ten times what text files take
+LEAST, PER_BYTE = 10.0, 1e-6  # [s, s/byte]: ten times the time of text files
 WAIT = 20  # seconds on the clock for one of the processor: others may use the machine
 
 
@@ -69,6 +69,7 @@ def read_foreign(path: Path, limit: float | None = None) -> meshio.Mesh:
 
 
 def _read(path: str, kind: str | None) -> meshio.Mesh:
+    """The mesh of a file by the format of that name; None: by its suffix. Raises ValueError: meshio's reason."""
     printed = io.StringIO()
     try:
         # meshio prints its complaints and may end the process; one sentence is enough.
@@ -80,7 +81,7 @@ def _read(path: str, kind: str | None) -> meshio.Mesh:
 
 
 def _leave(path: str, target: str, seconds: int) -> None:
-    """The program: write the mesh, or the reason as a text."""
+    """The program: write to ``target`` the mesh, or the reason as a text; ``seconds`` limit its processor time."""
     with contextlib.suppress(ImportError, ValueError):  # not POSIX, or a lower limit already: the clock then decides
         import resource
 

@@ -63,7 +63,7 @@ def bisect(whole: Whole, marked: Ints) -> Whole:
         place = place_text(points[cells[int(np.argmin(shape))]].mean(axis=0))
         raise MeshError(
             f"{whole.source} cannot be bisected further: {counted(int(flat.sum()), 'cell')} would be flat, the worst "
-            f"around {place}; remesh the body there or take a larger tissue.refine.tolerance."
+            f"around {place}; remesh the body there or use a larger tissue.refine.tolerance."
         )
     return result
 
@@ -128,7 +128,7 @@ class SizeField:
 def graded_line(cuts: Sequence[float], ends: Sequence[float], n: int, mu: float, radius: float) -> Floats:
     """N + 1 coordinates with a line at every cut, whose distances fall as min(1, r / R)^(1 - mu) towards the ends.
 
-    Each stretch between cuts takes its share of the n cells by int dx / h(x) and places them so that all are equal in
+    Each stretch between cuts gets its share of the n cells by int dx / h(x) and places them so that all are equal in
     this measure; no distance falls below 1 / `STEEPEST` of the largest size.
 
     Args:

@@ -50,7 +50,7 @@ class Discretisation:
     layer: np.ndarray  # number of the layer of each owned cell, (owned cells,)
 
     def nodal(self, free: Array, held: Array | float = 0.0) -> Any:
-        """The function with these values (n_local,) on the free dofs and ``held`` on the others. Collective."""
+        """The function with these values (n_local,) on the free dofs and ``held`` on the bonded ones. Collective."""
         result = dolfinx.fem.Function(self.V)
         result.x.array[: len(self.R)] = held
         result.x.array.reshape(-1, self.layout.dimension)[self.free] = free.reshape(-1, self.layout.dimension)
@@ -58,7 +58,7 @@ class Discretisation:
         return result
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which of the owned free nodes and which of the held ones lie on the boundary of the body. Collective."""
+        """Which of the owned free nodes and which of the bonded ones lie on the boundary of the body. Collective."""
         mesh = self.mesh.mesh
         mesh.topology.create_connectivity(self.mesh.dimension - 1, self.mesh.dimension)
         on, _ = contact_blocks(self.V, dolfinx.mesh.exterior_facet_indices(mesh.topology))
@@ -74,7 +74,7 @@ def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
     """Build the space and the block dof maps. Collective.
 
     Raises:
-        SceneError: the contact zone is empty, or a layer holds no cell.
+        SceneError: the contact zone is empty, or a layer has no cell.
         MeshError: part of the body is not held, or every node is in the contact zone.
     """
     d, comm = mesh.dimension, mesh.mesh.comm
@@ -206,7 +206,7 @@ def _assembled(comm: MPI.Intracomm, csr: Any, form: Any) -> PETSc.Mat:
 def layer_numbers(mesh: TissueMesh, scene: Scene) -> tuple[tuple[str, ...], np.ndarray]:
     """Names of the layers in the order of their blocks, and the number of the layer of each owned cell. Collective.
 
-    Later layers win where boxes overlap, the rest comes last as ``tissue``. Raises SceneError: a layer holds no cell.
+    Later layers win where boxes overlap, the rest comes last as ``tissue``. Raises SceneError: a layer has no cell.
     """
     names = (*scene.tissue.layers, "tissue")
     numbers = np.full(mesh.owned, len(names) - 1, dtype=np.intp)
@@ -219,7 +219,7 @@ def layer_numbers(mesh: TissueMesh, scene: Scene) -> tuple[tuple[str, ...], np.n
     counts = total(mesh.mesh.comm, np.bincount(numbers, minlength=len(names)).astype(np.float64))
     if not counts[:-1].all():
         empty = names[int(np.argmin(counts[:-1] > 0))]
-        raise SceneError(f"tissue.layers.{empty} holds no cell of {mesh.source}; check its tag or box")
+        raise SceneError(f"tissue.layers.{empty} has no cell of {mesh.source}; check its tag or box")
     return names if counts[-1] else names[:-1], numbers
 
 

@@ -45,7 +45,7 @@ class MeshEstimate:
     # relative errors of the two lowest frequencies that the run can see, omega_h / omega - 1 [1]
     omega: tuple[float, ...]
     time_error: float  # error of the time steps, relative like ``estimate`` [1]
-    shift: float  # largest distance of the ends of the zone held from ``contact.box`` [m]
+    shift: float  # largest distance of the ends of the contact zone from ``contact.box`` [m]
     n_e: int  # tissue unknowns of the mesh that was estimated [1]
     finer: int  # tissue unknowns of the mesh that it was compared with [1]
     # finer mesh: "order", the next order on the same cells, or "graded", another mesh, which meets the zone; "coarser":
@@ -235,12 +235,12 @@ def build(
         scene: a scene, the path of its file, or the name of one that ships.
         overrides: "section.key=value" each, as after ``--set``; for a file or a name.
         mesh: on which; None makes that of the scene.
-        run: its steps will be taken, so their tables must fit too.
+        run: its steps will be computed, so their tables must fit too.
 
     Raises:
         SceneError, MeshError: with one sentence that names the key or the file.
-        ResourceError: the memory of a node cannot hold it; estimated before anything is allocated, for a mesh file
-            when its cells are known.
+        ResourceError: it does not fit into the memory of a node, estimated before anything is allocated; a mesh file
+            is estimated when its cells are known.
     """
     if isinstance(scene, str | Path):
         scene = load_scene_collective(comm, scene, overrides)

@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import ResourceError, shortened
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.resources import free_memory
+from softgrasp.fem.resources import free_memory, size_text
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.costs import ITERATIVE, SolverName, Work
 
@@ -21,7 +21,7 @@ CELL_BYTES = {(2, 1): 1600.0, (2, 2): 9000.0, (2, 3): 25000.0, (3, 1): 2350.0, (
               (2, 4): 56000.0, (3, 4): 460000.0}  # fmt: skip
 LAYER_BYTES = {(2, 1): 600.0, (2, 2): 3900.0, (2, 3): 10800.0, (3, 1): 900.0, (3, 2): 13000.0, (3, 3): 60000.0,
                (2, 4): 24000.0, (3, 4): 180000.0}  # fmt: skip
-# Gradients, tangent and law of finite strain on each rank that holds the whole tissue; cubic ones by points and nodes.
+# Gradients, tangent and law of finite strain on each rank that stores the whole tissue; cubic ones by points and nodes.
 STRAIN_BYTES = {(2, 1): 1650.0, (2, 2): 12000.0, (2, 3): 40000.0, (3, 1): 5200.0, (3, 2): 97000.0, (3, 3): 420000.0}
 GIB = 2.0**30
 
@@ -60,7 +60,7 @@ def box_simplices(cells: list[int]) -> int:
 def need(scene: Scene, dimension: int, cells: int, ranks: int, free: float, run: bool) -> Need:
     """Estimate the memory of a model of ``cells`` triangles or tetrahedra and, if it will ``run``, of its steps.
 
-    ``free``: memory that the solver may take over all ranks [byte].
+    ``free``: memory that the solver may use over all ranks [byte].
     """
     kind, d = (dimension, scene.tissue.order), dimension
     n_e = max(int(kind[1] ** d / math.factorial(d) * cells * d), 1)  # p^d / d! nodes a cell in large regular meshes
@@ -100,12 +100,12 @@ def steps_of(scene: Scene, n: int, dimension: int, ranks: int) -> Work:
 
 
 def free_bytes(scene: Scene) -> float:
-    """Memory that a run may take on this node [byte]: ``output.memory``, or what is free."""
+    """Memory that a run may use on this node [byte]: ``output.memory``, or what is free."""
     return free_memory() if scene.output.memory == "auto" else scene.output.memory * GIB
 
 
 def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, cells: int) -> None:
-    """Refuse a model or run that the memory of some node cannot hold. Collective.
+    """Refuse a model or run that does not fit into the memory of some node. Collective.
 
     Raises ResourceError: on all ranks, with the key, the estimate, what the node has, and what would fit.
     """
@@ -133,8 +133,8 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
     where = f"{ranks} rank{'s' if ranks > 1 else ''} of {comm.size} on one node"
     needs = size_text(estimate.of(share, ranks))
     raise ResourceError(
-        f"{key} = {shortened(given)} needs about {needs} ({parts}) for {where}, where {size_text(free)} may be taken; "
-        f"take about {fits} or less, more nodes, or allow more with --set output.memory=GIB"
+        f"{key} = {shortened(given)} needs about {needs} ({parts}) for {where}, where {size_text(free)} may be used; "
+        f"use about {fits} or less, more nodes, or allow more with --set output.memory=GIB"
     )
 
 
@@ -169,12 +169,3 @@ def _digits(value: float) -> int:
     whole = int(value)
     step: int = 10 ** max(len(str(whole)) - 2, 0)
     return whole // step * step
-
-
-def size_text(size: float) -> str:
-    """A number of bytes with its unit."""
-    for unit in ("byte", "KiB", "MiB", "GiB"):
-        if size < 1000:
-            return f"{size:.3g} {unit}"
-        size /= 1024
-    return f"{size:.3g} TiB"

@@ -27,7 +27,7 @@ class Output:
     weight: float  # every listed dof enters with this factor
     C_s: Array  # rigid part, (size, n_s), on every rank
     point: tuple[float, ...] = ()  # coordinates [m] of the node, or of the centre of the region
-    place: str = ""  # the node that is taken, or the nodes of the mean, in words; empty for the hand
+    place: str = ""  # the chosen node, or the nodes of the mean, in words; empty for the hand
 
     @property
     def size(self) -> int:
@@ -43,7 +43,7 @@ class Output:
 def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     """Outputs of the scene; without any, the free node farthest from the hand. Collective.
 
-    Raises SceneError: a node lies outside the body or a region holds no node.
+    Raises SceneError: a node lies outside the body or a region has no node.
     """
     entries = scene.control.outputs if scene.control is not None else []
     if not entries:
@@ -92,7 +92,7 @@ def _taken(system: BlockSystem, point: Array, where: Array) -> str:
         text += f", one of {len(equal)} equally near to {_coordinates(point)}"
     elif least > 0:
         text += f", nearest to {_coordinates(point)}"
-    return text + ("; the hand holds a nearer one" if nearer < least else "")
+    return text + ("; a nearer one is bonded to the hand" if nearer < least else "")
 
 
 def _coordinates(point: Sequence[float] | Array) -> str:
@@ -114,19 +114,17 @@ def _region(system: BlockSystem, name: str, box: Array, i: int) -> Output:
     dofs = inside[:, None] * d + np.arange(d)
     free, carried = (int(n) for n in total(layout.comm, np.array([float(len(inside)), float(len(held))])))
     if free == 0:
-        raise SceneError(
-            f"control.outputs[{i}].box = {box.tolist()} holds no free node of the body; move or enlarge it"
-        )
+        raise SceneError(f"control.outputs[{i}].box = {box.tolist()} has no free node of the body; move or enlarge it")
     count = free + carried  # nodes in the contact zone move with the hand
     R = rigid_modes(held, d, layout.n_s > d, layout.reference).reshape(-1, d, layout.n_s)
     C_s = total(layout.comm, system.T[dofs].sum(axis=0) + R.sum(axis=0)) / count
-    place = f"mean of {count} nodes" + (f", {carried} of them held by the hand" if carried else "")
+    place = f"mean of {count} nodes" + (f", {carried} of them bonded to the hand" if carried else "")
     return Output(name, hand_columns(d, d, name), dofs, 1.0 / count, C_s, tuple(box.mean(axis=0).tolist()), place)
 
 
 def _inside(system: BlockSystem, point: list[float], i: int) -> None:
     layout = system.layout
-    low, high = bounding_box(layout.comm, np.vstack([layout.nodes, layout.held]))  # the hand may hold whole sides
+    low, high = bounding_box(layout.comm, np.vstack([layout.nodes, layout.held]))  # whole sides may be bonded
     p = np.asarray(point, dtype=float)
     slack = 0.05 * float((high - low).max())  # a point that was read off a picture
     if (p < low - slack).any() or (p > high + slack).any():

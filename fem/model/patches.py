@@ -17,7 +17,7 @@ def make_patches(V: Any, free: NDArray[Any]) -> Patches:
     """Stars of the vertices of a space of order 2 or more, in whatever cells. Collective.
 
     A node of an edge, face or cell is in the stars of the vertices of that entity. A rank lists the stars of the
-    vertices that it owns; what only cells of other ranks show of them is sent to it.
+    vertices that it owns; neighbours that only cells of other ranks have are sent to it.
 
     ``free``: owned local numbers of the nodes that are unknowns, ascending.
     """

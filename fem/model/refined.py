@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 ACROSS = {2: {1: 32.0, 2: 3.5, 3: 3.0}, 3: {1: 8.0, 2: 1.8, 3: 2.0}}
 MORE = {1: 0.0, 2: 0.7, 3: 0.0}  # cells beside these, for coarse meshes: with them the first estimate meets 1e-2
 LINES_ACROSS = {2: {1: 24.0, 2: 8.0, 3: 5.0}, 3: {1: 16.0, 2: 6.0, 3: 4.0}}
-# Smallest cell over tolerance times shortest side: what an end costs is about proportional to it.
+# Smallest cell over tolerance times shortest side: the cells at an end are about proportional to it.
 SMALLEST = {2: {1: 0.1, 2: 0.4, 3: 1.0}, 3: {1: 16.0, 2: 48.0, 3: 96.0}}
 DEEPEST = {2: 1 / 256, 3: 1 / 8}  # smallest over largest cell without a tolerance: edges in 3D fill a body quickly
 SHRINK = 1.25  # of the tolerance, from mesh to mesh, until the unknowns fit
@@ -195,7 +195,7 @@ def lattice(cells: list[int], order: int) -> int:
 def _too_large(refine: Refine, count: int) -> SceneError:
     return SceneError(
         f"tissue.refine.most = {refine.most} unknowns are fewer than the {count} of the coarsest mesh that "
-        "[tissue.refine] allows; raise it, or take larger cells or a lower tissue.order."
+        "[tissue.refine] allows; raise it, or use larger cells or a lower tissue.order."
     )
 
 

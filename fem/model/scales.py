@@ -45,7 +45,7 @@ def _top(rows: Array, limit: float) -> Array:
 def magnified(system: BlockSystem, z: Array) -> float:
     """Share by which one rounding of K_ee may change the deformation z: eps sum K_ii z_i^2 / z'Kz [1].
 
-    Neither residual nor drift knows of it, since both take the rounded matrix for the true one; close to nu = 1/2 they
+    Neither residual nor drift contains it, since both are computed with the rounded matrix; close to nu = 1/2 they
     are ten to a hundred times smaller than the error. Collective; z are local rows (n_local,).
     """
     diagonal = system.K_ee.getDiagonal()

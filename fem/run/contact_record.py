@@ -43,6 +43,14 @@ class ContactRecord:
         """Largest depth of a boundary node at the end of a step [m]."""
         return max(0.0, -float(self.gap.min(initial=0.0)))
 
+    @property
+    def force_end(self) -> Array:
+        """Force of each obstacle on the tissue at the end, mean of the last two steps, (obstacles, d) [N].
+
+        The midpoint rule lets the forces of stiff modes alternate from step to step.
+        """
+        return np.asarray(self.force[-2:].mean(axis=0))
+
 
 @dataclass
 class Tables:

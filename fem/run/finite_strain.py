@@ -23,7 +23,6 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, combine, driven_by_root, total
 from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState, viscosity
-from softgrasp.fem.solve.solvers import ITERATIVE
 from softgrasp.fem.strain.body import HyperelasticBody
 from softgrasp.fem.strain.newton import Counts, NewtonFigures, Pairs, QuasiNewton, Root
 from softgrasp.fem.strain.points import whole_points
@@ -39,7 +38,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
     Attributes:
         r: s pi_n on the rows here, in place of the linear step's right-hand side.
         counts: convergence record of the run.
-        refactor_cost: iterations that take about as long as a tangent and its factor [1], estimated from sizes, so
+        refactor_cost: iterations of the same time as a tangent and its factor [1], estimated from sizes, so
             that it is the same in every run.
     """
 
@@ -62,7 +61,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
             points.tol,
         )
         if not self.comm.allreduce(self.body.kernel is not None, MPI.LAND):
-            self.body.kernel = None  # ranks that hold all rows compute the same bits
+            self.body.kernel = None  # ranks that store all rows compute the same bits
         self.inertia, self.drag = (*self.operators.parts, None)[:2]
         for part in self.operators.parts:
             part.convert("aij")
@@ -87,11 +86,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
     now: TissueState  # state at the beginning of the step in work
 
     def _refactor_cost(self) -> float:
-        """Iterations that take about as long as a tangent and its factor [1]: entries of the factor over 4 n_e."""
-        if self.solver.name in ITERATIVE:
-            return 8.0
-        nz = self.solver.ksp.getPC().getFactorMatrix().getInfo()["nz_used"]
-        return float(np.clip(nz / (4 * self.system.layout.n_e), 8, 100))
+        """Iterations of the same time as a tangent and its factor [1]: entries of the factor over 4 n_e."""
+        return float(np.clip((self.solver.entries or 0.0) / (4 * self.system.layout.n_e), 8, 100))
 
     def _dots(self, A: Array, x: Array) -> Array:
         products = A @ x
@@ -303,7 +299,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         J, place = self.body.lowest(self.body.J, None if self.operators.whole else self.comm)
         raise SolverError(
             f"finite strain ({self.body.law.name}): no convergence (16 substeps did not help); in the cell at "
-            f"{place} the last trial has det F = {J:.3g}: take more time.steps, a finer mesh or a gentler motion"
+            f"{place} the last trial has det F = {J:.3g}: use more time.steps, a finer mesh or a gentler motion"
         )
 
     def _balanced(self, c: Array, feedback: Feedback, begin: Begin) -> Root | None:

@@ -1,4 +1,4 @@
-"""What the run of a scene would cost on other ranks, by the model of :mod:`softgrasp.fem.solve.costs`.
+"""Modelled time and memory of a scene's run on other ranks, by :mod:`softgrasp.fem.solve.costs`.
 
 Seconds of cores like the one where its constants were measured; pictures and the estimate of the mesh come on top.
 """
@@ -13,7 +13,8 @@ import psutil
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.memory import free_bytes, need, size_text, steps_of
+from softgrasp.fem.model.memory import free_bytes, need, steps_of
+from softgrasp.fem.resources import size_text
 from softgrasp.fem.run.frames import frame_count
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.costs import BUILD, ENTRIES, ITERATIVE, SolverName, seams
@@ -25,12 +26,12 @@ PRODUCTS = 2  # products of a step beside its solve, those of its vectors includ
 # Time of a frame of the field files, by dimension and order [s a cell].
 FRAME = {(2, 1): 3.5e-7, (2, 2): 6e-7, (2, 3): 1.1e-6, (3, 1): 3.5e-7, (3, 2): 8e-7, (3, 3): 3e-6}
 RELIABLE = f"wrong by a factor of {TYPICAL:g}, at most {WORST:g}, on the machine where it was measured (1 and 2 ranks)"
-RANKS = (1, 2, 16, 128)  # numbers of ranks that are told
+RANKS = (1, 2, 16, 128)  # numbers of ranks in the forecast
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Modelled cost of a run."""
+    """Modelled time and memory of a run."""
 
     ranks: int  # number of ranks [1]
     solver: SolverName  # solver of the steps
@@ -49,13 +50,13 @@ class Forecast:
 
 
 def forecast(scene: Scene, n: int, d: int, cells: int, ranks: int, free: float = np.inf) -> Forecast:
-    """The cost of a linear run on so many ranks.
+    """Modelled time and memory of a linear run on so many ranks.
 
     Args:
         n: unknowns of the tissue.
         d: dimension.
         cells: triangles or tetrahedra.
-        free: memory that the solver may take over all ranks [byte].
+        free: memory that the solver may use over all ranks [byte].
     """
     kind, work, share = (d, scene.tissue.order), steps_of(scene, n, d, ranks), seams(n, d, ranks)
     name, requested = work.solver(scene.time.solver, free), scene.time.solver
@@ -80,7 +81,7 @@ def forecast(scene: Scene, n: int, d: int, cells: int, ranks: int, free: float =
 
 
 def forecasts(model: Model) -> tuple[Forecast, ...]:
-    """The cost of a model's run on its own number of ranks and on :data:`RANKS`; none at finite strain. Collective.
+    """Modelled time and memory of a run on its own number of ranks and on :data:`RANKS`, linear only. Collective.
 
     Ranks beyond the cores of this node are on further nodes like it.
     """

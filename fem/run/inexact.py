@@ -2,7 +2,7 @@
 
 With S w = r - rho the step of `softgrasp.fem.run.midpoint` changes the energy by 2 w'G c - 2 s w'D w - 2 w'rho, if its
 momentum goes on with the product S w in place of r. Scaling w by w'r / w'S w makes w'rho = 0. The solves begin with
-what the last ones tell (`softgrasp.fem.solve.guess`).
+the last solutions (`softgrasp.fem.solve.guess`).
 
 A step adds an error of energy 2 rho'S^-1 rho at most, which later steps do not magnify. As these errors point anywhere,
 their energies are summed; the preconditioner stands for S^-1.
@@ -30,7 +30,7 @@ class InexactMidpoint(TissueMidpoint):
         iterations: of each solve of a step since the start.
         squares: sum of |rho|^2 over the steps since the start [N^2].
         softness: largest rho'S^-1 rho / |rho|^2 of the steps that were checked [m/N].
-        strain: largest elastic energy z'K z / 2 at which the energy was taken [J].
+        strain: largest elastic energy z'K z / 2 at the instants whose energy was computed [J].
     """
 
     def _prepare(self) -> None:
@@ -115,11 +115,11 @@ class InexactMidpoint(TissueMidpoint):
     def advance(self, old: TissueState, new: TissueState) -> None:
         """Write the new state and carry k and r on, with S w in place of r. Collective."""
         super().advance(old, new)
-        if self.operators.D is None:  # else the momentum is M v and asks for no S w
+        if self.operators.D is None:  # else the momentum is M v and needs no S w
             self.r.axpy(self.a, self.defect)
 
     def residual(self) -> float:
-        """Check a solve as the exact step does, and take the softness of its defect. Collective."""
+        """Check a solve as the exact step does, and measure the softness of its defect. Collective."""
         square = self.defect.dot(self.defect)
         if square > 0:
             y = self.defect.duplicate()

@@ -15,7 +15,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 def interruptible(speaks: bool = False) -> Iterator[list[bool]]:
     """Turn the first Ctrl-C or SIGTERM into an entry of the list; a second one ends the program at once.
 
-    ``speaks``: say on the standard error that the first one was seen.
+    ``speaks``: report the first one on the standard error.
     """
     flag: list[bool] = []
 

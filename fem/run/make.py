@@ -20,13 +20,13 @@ def make_midpoint(
 ) -> TissueMidpoint:
     """The step of a system, linear or of finite strain; arguments as for `TissueMidpoint`. Collective.
 
-    ``rtol``: None for that of the solver, `STEP_RTOL`; Newton's method, which has a tolerance of its own, takes 1e-4.
+    ``rtol``: None for that of the solver, `STEP_RTOL`; Newton's method, which has a tolerance of its own, uses 1e-4.
     ``touching``: contact with obstacles acts on the step. Raises SolverError: the solver cannot do that.
     """
     if touching:
         if solver in ITERATIVE:
             raise SolverError(
-                f"contact needs a factor of the step, and '{solver}' has none; take time.solver = 'mumps' and "
+                f"contact needs a factor of the step, and '{solver}' has none; use time.solver = 'mumps' and "
                 "the memory for it, or a coarser mesh"
             )
         from softgrasp.fem.run.contact_step import ContactMidpoint  # only scenes with contact pay for it

@@ -79,7 +79,7 @@ class Feedback(NamedTuple):
 class TissueMidpoint:
     """The tissue half of the step, for a load known at the midpoint.
 
-    When every rank holds the whole factor it holds the vectors whole as well, and these calls send no message: all
+    When every rank stores the whole factor it stores the whole vectors too, and these calls send no message: all
     ranks compute the same numbers, in the order in which the factor has its rows, and each writes its own rows into
     the state.
 
@@ -119,7 +119,7 @@ class TissueMidpoint:
             )
         self._solve = self.solver.solve if self.solver.factor is None else self.solver.factor.solve
         self.r, self.k, self.w = (self.K2.createVecLeft() for _ in range(3))
-        # views stay valid for the life of a vector; asking PETSc for them costs as much as a short dot product
+        # views stay valid for the life of a vector; a call of PETSc for them needs the time of a short dot product
         self.w_array, self.r_array, self.k_array = self.w.array_w, self.r.array_r, self.k.array_r
         self._couple()
         self.x, self._move = self.w, self._held_z
@@ -132,7 +132,7 @@ class TissueMidpoint:
         self._prepare()
 
     def _parts(self) -> tuple[PETSc.Mat, ...]:
-        """Further matrices to hold. Collective."""
+        """Further matrices that every rank stores whole. Collective."""
         return ()
 
     def _prepare(self) -> None:
@@ -163,7 +163,7 @@ class TissueMidpoint:
     def _couple(self) -> None:
         """G as a dense matrix of this rank alone, with vectors that share the arrays of r and w.
 
-        PETSc adds a product to r, or takes one with w, in one pass and with less overhead than NumPy.
+        PETSc adds a product to r, or multiplies by w, in one pass and with less overhead than NumPy.
         """
         n_s = self.G.shape[1]
         self.coupling = PETSc.Mat().createDense(self.G.shape, array=np.asfortranarray(self.G), comm=PETSc.COMM_SELF)
@@ -315,7 +315,7 @@ class TissueMidpoint:
         return share if self.operators.whole else float(total(self.system.layout.comm, np.array([share]))[0])
 
     def residual(self) -> float:
-        """Check a solve, before :meth:`advance` takes r further; raises SolverError. Collective.
+        """Check a solve, before :meth:`advance` moves r on; raises SolverError. Collective.
 
         In equilibrium under gravity the load cancels in r, and a two-way step subtracts the hand's part from w: what is
         left is small against the load, not against the rounding in r.

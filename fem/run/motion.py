@@ -43,7 +43,7 @@ def quintic(t: Array, duration: float) -> tuple[Array, Array, Array]:
 class Profile:
     """Time law of the hand: a rest-to-rest quintic to a target (0: at rest), or a table that a CSV file gave."""
 
-    drive: Literal["motion", "force"]  # what it says: the motion of the hand, or the force on it
+    drive: Literal["motion", "force"]  # columns: the motion of the hand, or the force on it
     end: float  # of the run [s]
     target: Array  # of the quintic, (n_s,) [m, rad]
     duration: float  # of the quintic [s]
@@ -101,7 +101,7 @@ def motion_table(scene: Scene, n_s: int) -> HandTable:
     if steps < profile.fewest:
         raise SceneError(
             f"time.steps = {steps} gives steps of {profile.end / steps:g} s, too long for a move of "
-            f"{profile.duration:g} s; take at least {profile.fewest}"
+            f"{profile.duration:g} s; use at least {profile.fewest}"
         )
     return profile.motion(steps)
 
@@ -209,7 +209,7 @@ class ForceDrive:
         self.q[n + 1] = self.q[n] + self.dt * (v + self.v[n + 1]) / 2
 
     def check(self, begin: int, end: int) -> None:
-        """Look at the forces taken in these steps, once a segment: a step spends nothing on it.
+        """Check the forces of these steps, once a segment, so that a step needs no time for it.
 
         Raises SolverError: a force is not finite; the message names the first.
         """

@@ -306,9 +306,9 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
     Raises:
         SolverError: a solve failed or missed its tolerance.
         ResourceError: the snapshots do not fit.
-        CheckpointError: resume was asked for and no fitting restart file is there.
+        CheckpointError: resume was requested and no fitting restart file is there.
         Interrupted: Ctrl-C or SIGTERM; Paused: ``until``; the message names the restart file.
-        SceneError: another run holds the folder into which this one would write.
+        SceneError: another run has locked the folder into which this one would write.
 
     >>> import softgrasp as sg
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=60"])
@@ -342,7 +342,7 @@ def _simulate(model: Model, options: RunOptions, force: Force | None) -> Traject
 
 
 def _frame(run: Run, options: RunOptions) -> str:
-    """Take a frame; why there is no room for it, or nothing. Collective."""
+    """Store a frame; returns why there is no room for it, or an empty string. Collective."""
     try:
         if options.frame is not None:
             options.frame(run)
@@ -372,7 +372,7 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
         run.store.flush(run.reached)
         if run.reached in run.milestones:
             run.watch_energy()
-        # rank 0 sets the pace, all agree whether somebody asked to stop
+        # rank 0 sets the pace, all agree whether a signal has arrived
         chunk = comm.bcast(int(np.clip(0.2 / max(pace, 1e-7), 1, 10_000)))
         full = _frame(run, options) if run.reached in frames else ""
         if options.progress is not None:

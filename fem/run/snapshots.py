@@ -71,7 +71,7 @@ class NoStore:
         return np.zeros((0, 0))
 
     def restore(self, columns: Array, step: int, run: str) -> None:
-        """Take back what :meth:`kept` gave in the run of that name."""
+        """Restore what :meth:`kept` returned in the run of that name."""
 
     def finish(self, times: Array, q: Array, v: Array) -> Snapshots | None:
         """The stored snapshots, or None when they are not in memory. Collective."""
@@ -127,7 +127,7 @@ class MemoryStore(NoStore):
 
 
 class Hdf5Store(NoStore):
-    """Columns go through a buffer to one HDF5 file a rank; ``snapshots.h5`` shows them as one.
+    """Columns go through a buffer to one HDF5 file a rank; ``snapshots.h5`` presents them as one.
 
     Datasets of ``snapshots.h5``: z, v (m, n_e), nodes (n_e / d, d), times, steps (m,), q_s, v_s (m, n_s). Raises
     ResourceError: the files of all ranks would not fit on the disk.
@@ -210,7 +210,7 @@ class Hdf5Store(NoStore):
     def restore(self, columns: Array, step: int, run: str) -> None:
         """Go on behind what is already in the file, which is read once to see that it is whole.
 
-        Raises CheckpointError: the file is of another run, is damaged or holds less.
+        Raises CheckpointError: the file is of another run, is damaged or has fewer columns.
         """
         self.written, path = int(np.searchsorted(self.steps, step, side="right")), self.path
         if self.owner != run:

@@ -120,12 +120,12 @@ class Stepped(ABC):
 def make_ts(run: Stepped) -> Any:
     """PETSc TS around a run. Collective.
 
-    TS copies its solution before every step, for a rollback that nothing here asks for. Of z and v that would be a pass
-    over memory, so the state stays with the run, and TS holds one number a rank.
+    TS copies its solution before every step, for a rollback that is never needed here. Of z and v that would be a pass
+    over memory, so the state stays with the run, and TS has one number a rank.
     """
     ts = PETSc.TS().createPython(run, comm=run.layout.comm)
     ts.setTimeStep(run.dt)
-    ts.setMaxTime(1e300)  # stepping by time would take one step too many or change the last one
+    ts.setMaxTime(1e300)  # stepping by time would make one step too many or change the last one
     ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
     counter = PETSc.Vec().createWithArray(np.zeros(1), comm=run.layout.comm)
     ts.setSolution(counter)

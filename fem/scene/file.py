@@ -187,7 +187,7 @@ def _parse(text: str, override: str) -> Any:
     except ValueError as error:
         raise SceneError(f"--set {shortened(override)}: it {error}") from None
     if table.keys() != {"value"}:
-        raise SceneError(f"--set {shortened(override)}: it must hold one value")
+        raise SceneError(f"--set {shortened(override)}: it must have one value")
     return table["value"]
 
 

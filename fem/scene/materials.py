@@ -36,7 +36,7 @@ def young_poisson(lam: float, mu: float) -> tuple[float, float]:
 _TISSUE = "order of magnitude; {}"
 _SMOOTH_ON = (
     "modulus at 100 % strain and density from the Smooth-On technical bulletin of the {}; the secant "
-    "modulus at 100 % stands for E, nu chosen"
+    "modulus at 100 % is used as E, nu chosen"
 )
 
 LIBRARY: dict[str, LibraryMaterial] = {

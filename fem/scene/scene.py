@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, PrivateAttr, model_validator
 
@@ -19,6 +19,9 @@ from softgrasp.fem.scene.control import BASES, Control, ControlOutput, Loop, Red
 from softgrasp.fem.scene.obstacles import Obstacle, check_obstacle_vectors, check_obstacles
 from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, NonNegative, Positive, Section, Tissue
 from softgrasp.fem.shown import Card, Shown, brief, listed
+
+if TYPE_CHECKING:
+    from softgrasp.fem.mesh.given import GivenMesh
 
 __all__ = [
     "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Loop", "Material",
@@ -112,7 +115,7 @@ class Motion(Section):
         if self.profile == "quintic" and self.target is None:
             raise ValueError("target is missing; the quintic profile needs it (profile = 'hold' for none)")
         if self.profile != "quintic" and self.target is not None:
-            raise ValueError(f"target cannot go with profile = '{self.profile}'; only 'quintic' takes it")
+            raise ValueError(f"target cannot go with profile = '{self.profile}'; only 'quintic' has it")
         if (self.profile == "csv") != (self.csv is not None):
             raise ValueError("csv and profile = 'csv' go together; give both or neither")
         return self
@@ -134,8 +137,8 @@ class Time(Section):
     )
     reproducible: Literal["auto"] | bool = Field(
         "auto",
-        description="equal bits in every run on the same number of ranks: each holds the whole factor [no unit]; "
-        "auto: on up to 4 ranks, in 3D to 40 000 unknowns over the number of ranks; true takes about twice the time of "
+        description="equal bits in every run on the same number of ranks: each stores the whole factor [no unit];  "
+        "auto: on up to 4 ranks, in 3D to 40 000 unknowns over the number of ranks; true needs about twice the time of "
         "a spread factor beyond, and the memory of the whole one on each rank",
     )
 
@@ -157,7 +160,7 @@ class Output(Section):
         0, description="steps between restart files [1]; 0: only on interrupt"
     )
     memory: Literal["auto"] | Positive = Field(
-        "auto", description="memory that a run may take on each node [GiB]; auto: what is free when it starts"
+        "auto", description="memory that a run may use on each node [GiB]; auto: what is free when it starts"
     )
 
 
@@ -199,6 +202,7 @@ class Scene(Shown, Section):
     """results that are kept [no unit]"""
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
     _mesh_digest: str = PrivateAttr("")  # of the mesh file, once it was read
+    _given: GivenMesh | None = PrivateAttr(None)  # mesh of the user's own in the place of the file
 
     def card(self) -> Card:
         """Purpose, body, effects, motion and steps."""
@@ -236,6 +240,7 @@ class Scene(Shown, Section):
         edit(data)
         result = Scene.model_validate(data)
         result._directory = self._directory
+        result._given = self._given if result.tissue.mesh == self.tissue.mesh else None
         return result
 
     def path(self, name: str) -> Path:
@@ -249,12 +254,12 @@ class Scene(Shown, Section):
         return [self.path(name) for name in (self.tissue.mesh, self.motion.csv, *paths) if name is not None]
 
     def refuse_contact(self, what: str) -> None:
-        """Say that contact is not part of what is asked for. Raises SceneError: ``effects.obstacles`` is on."""
+        """Refuse what contact is not part of. Raises SceneError: ``effects.obstacles`` is on."""
         if self.effects.obstacles:
             from softgrasp.fem.errors import SceneError  # imports MPI, which the models do without
 
             raise SceneError(
-                f"scene '{self.name}': {what} cannot go with effects.obstacles yet; take --set effects.obstacles=false "
+                f"scene '{self.name}': {what} cannot go with effects.obstacles yet; use --set effects.obstacles=false "
                 "--set obstacle=false for a model without contact"
             )
 
@@ -290,13 +295,13 @@ def _check_contact(scene: Scene) -> None:
         raise ValueError("obstacle is missing; effects.obstacles needs at least one [[obstacle]]")
     if scene.tissue.refine is not None and scene.tissue.refine.tolerance is not None:
         raise ValueError(
-            "tissue.refine.tolerance cannot go with effects.obstacles, which no estimate of it knows; drop it"
+            "tissue.refine.tolerance cannot go with effects.obstacles, which its estimate does not include; drop it"
         )
     if scene.effects.finite_strain is not None:
         raise ValueError("effects.obstacles cannot go with effects.finite_strain yet; set one of them to false")
     if scene.time.solver in ("cg", "stars"):
         raise ValueError(
-            f"time.solver is '{scene.time.solver}'; effects.obstacles needs a factor, take 'auto' or 'cholesky'"
+            f"time.solver is '{scene.time.solver}'; effects.obstacles needs a factor, use 'auto' or 'cholesky'"
         )
 
 

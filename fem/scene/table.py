@@ -1,4 +1,4 @@
-"""Tables of a motion over time, which a CSV file holds."""
+"""Tables of a motion over time, read from a CSV file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def read_csv(
 
     Args:
         columns: values in a row beside the time.
-        end: of the run [s]; None takes the file as long as it is, from 0 on.
+        end: of the run [s]; None: the time of the last row.
         key: who names the file, for the messages.
         meaning: what the columns are, for the messages.
 

@@ -16,7 +16,7 @@ from typing import Any
 from softgrasp.fem.errors import no_pipe
 
 LARGEST, SMALLEST = 1e50, 1e-50  # squares of areas and of energies stay within double precision
-INTEGER = 2**63  # what TOML, HDF5 and PETSc hold
+INTEGER = 2**63  # what TOML, HDF5 and PETSc can represent
 DEEPEST = 16  # tables and lists in each other; a scene needs 6
 LETTERS = 4096  # of a text: the longest path of Linux
 KEY = 80  # letters of a key
@@ -89,9 +89,9 @@ def _wrong(value: Any) -> str:
     """Why a value is beyond all use; empty if it is not."""
     if isinstance(value, str):
         if len(value) > LETTERS:
-            return f"has {len(value)} letters; at most {LETTERS} are taken"
+            return f"has {len(value)} letters; at most {LETTERS} are accepted"
         if sign := _CONTROL.search(value):
-            return f"holds the control character {sign[0]!a}; give text without it"
+            return f"has the control character {sign[0]!a}; give text without it"
     elif isinstance(value, int) and not -INTEGER <= value < INTEGER:
         return f"is an integer of {value.bit_length()} bits; integers lie between -2^63 and 2^63"
     elif isinstance(value, float) and (bounds := out_of_range(value)):
@@ -124,7 +124,7 @@ def read_table(path: Path, columns: int) -> list[list[float]]:
         except ValueError as error:
             if i == 0 and not _number(line[0]):
                 continue
-            raise ValueError(f"holds a value that is not a number in data row {len(rows) + 1} ({error})") from None
+            raise ValueError(f"has a value that is not a number in data row {len(rows) + 1} ({error})") from None
         if len(row) != columns:
             raise ValueError(f"has {len(row)} entries in data row {len(rows) + 1}; it must have {columns} columns")
         for j, value in enumerate(row):

@@ -1,4 +1,4 @@
-"""Parts of the scene that describe the tissue and where it is held; see `fem.scene.scene`."""
+"""Parts of the scene that describe the tissue and its contact zone; see `fem.scene.scene`."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ class Refine(Section):
     )
     contact: Literal["inherit", "select"] = Field(
         "inherit",
-        description="contact zone of a bisected mesh [no unit]: the parts of the facets held before, or those selected "
+        description="contact zone of a bisected mesh [no unit]: parts of the facets bonded before, or those selected "
         "again by their midpoints; layers alike",
     )
     passes: Annotated[int, Field(ge=0)] = Field(
@@ -178,7 +178,7 @@ class Refine(Section):
     @model_validator(mode="after")
     def _check(self) -> Refine:
         if self.tolerance is not None and self.tolerance < ROUNDING:
-            raise ValueError(f"tolerance is {self.tolerance}; below {ROUNDING:g} rounding decides, take a larger one")
+            raise ValueError(f"tolerance is {self.tolerance}; below {ROUNDING:g} rounding decides, use a larger one")
         if self.tolerance is not None and self.grading == "off":
             raise ValueError("grading is 'off'; a tolerance needs graded cells, drop one of them")
         return self
@@ -219,11 +219,11 @@ class Tissue(Section):
     @model_validator(mode="after")
     def _check(self) -> Tissue:
         if "tissue" in self.layers:
-            raise ValueError("layers.tissue takes the name of the cells that no layer claims; give it another name")
+            raise ValueError("layers.tissue is the name of the cells outside of all layers; give it another name")
         if self.mesh is not None:
             given = [key for key in ("size", "cells", "origin") if getattr(self, key) is not None]
             if self.refine is not None and self.refine.method == "lines":
-                raise ValueError("refine.method is 'lines'; a mesh file has no lines to move, take 'bisect'")
+                raise ValueError("refine.method is 'lines'; a mesh file has no lines to move, use 'bisect'")
             if given:
                 drop = " ".join(f"--set tissue.{key}=false" for key in given)
                 raise ValueError(f"{' and '.join(given)} cannot go with tissue.mesh; drop them, or mesh ({drop})")

@@ -1,7 +1,7 @@
-"""Cholesky in blocks of d x d of a matrix that one rank holds, and the order of its rows.
+"""Cholesky in blocks of d x d of a matrix that one rank stores, and the order of its rows.
 
-PETSc's solves with blocks take less time than those with single entries (``python -m benchmarks forward``
-prints both): one index serves d^2 numbers, and d unknowns at a time. But PETSc takes such a matrix in the order in
+PETSc's solves with blocks need less time than those with single entries (``python -m benchmarks forward``
+prints both): one index serves d^2 numbers, and d unknowns at a time. But PETSc factors such a matrix in the order in
 which it comes, so the rows are put in order first (:func:`dissect`); and it multiplies by inverses of
 the blocks on the diagonal, which is stable only while these are well conditioned [DHS95]. So two solves are measured,
 and a factor of single entries is made where blocks would lose digits.
@@ -17,7 +17,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import PETSc, rows_on_all, to_scipy
+from softgrasp.fem.petsc import PETSc, from_options, rows_on_all, to_scipy, user_options
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Dissection:
     order: NodeOrder  # of the nodes
     before: tuple[NDArray[Any], NDArray[Any]]  # row pointers and columns of the blocks before
     after: tuple[NDArray[Any], NDArray[Any]]  # row pointers and columns of the blocks in this order
-    source: NDArray[np.intp]  # where each block of ``after`` stood before
+    source: NDArray[np.intp]  # earlier place of each block of ``after``
 
     def matrix(self, A: PETSc.Mat) -> PETSc.Mat:
         """A of the same pattern with rows and columns in this order, in blocks of d x d (BAIJ).
@@ -91,7 +91,7 @@ def _rows(nodes: NDArray[np.intp], d: int) -> NDArray[np.intp]:
 
 
 # Stable factors leave below 1e-15, in whatever units and however ill-conditioned; blocks may leave 1e-14 and more, as
-# in the hard cases with layers or nu near 0.5. Ten rounding units tell them apart.
+# in the hard cases with layers or nu near 0.5. Ten rounding units separate them.
 BACKWARD_ERROR = 10 * float(np.finfo(float).eps)
 VANISHING_PIVOT = (71, 81)  # PETSC_ERR_MAT_LU_ZRPVT, PETSC_ERR_MAT_CH_ZRPVT
 
@@ -101,14 +101,16 @@ def factor_blocks(P: PETSc.Mat, prefix: str, entries: Literal["petsc", "mumps"] 
 
     Args:
         P: the matrix in blocks of d x d (BAIJ), on this rank alone.
-        entries: who factors single entries where blocks are not stable.
+        entries: who factors single entries where blocks are not stable, or where the user gave options for the prefix,
+            which PETSc serves for single entries only.
 
     Raises SolverError: a pivot vanishes, or PETSc gives up.
     """
-    ksp = make_ksp(P.convert("sbaij", PETSc.Mat()), prefix)
-    if _factored(ksp) and (P.getBlockSize() == 1 or backward_error(P, ksp) <= BACKWARD_ERROR):
-        return ksp
-    ksp.destroy()
+    if not user_options(prefix):
+        ksp = make_ksp(P.convert("sbaij", PETSc.Mat()), prefix)
+        if _factored(ksp) and (P.getBlockSize() == 1 or backward_error(P, ksp) <= BACKWARD_ERROR):
+            return ksp
+        ksp.destroy()
     single = P.convert("aij", PETSc.Mat())
     single.setOption(PETSc.Mat.Option.SPD, True)
     ksp = make_ksp(single, prefix, entries)
@@ -159,7 +161,7 @@ def make_ksp(P: PETSc.Mat, prefix: str, by: Literal["petsc", "mumps"] = "petsc")
     ksp = PETSc.KSP().create(P.comm)
     ksp.setOptionsPrefix(prefix)
     ksp.setOperators(P)
-    P.destroy()  # the ksp holds it
+    P.destroy()  # the ksp owns it
     ksp.setType("preonly")
     pc = ksp.getPC()
     pc.setType("cholesky")
@@ -167,7 +169,50 @@ def make_ksp(P: PETSc.Mat, prefix: str, by: Literal["petsc", "mumps"] = "petsc")
         pc.setFactorSolverType("mumps")
     else:
         pc.setFactorOrdering("natural")
+    from_options(ksp)
     return ksp
+
+
+def solve_checked(ksp: PETSc.KSP, r: PETSc.Vec, w: PETSc.Vec, name: str) -> None:
+    """Solve S w = r. Collective. Raises SolverError: the iteration does not converge."""
+    ksp.solve(r, w)
+    if ksp.getConvergedReason() < 0:
+        advice = "choose time.solver = 'mumps' or a larger time.rtol"
+        if user_options(prefix := ksp.getOptionsPrefix()):
+            advice = f"change the PETSc options -{prefix}*, such as a larger ksp_max_it or ksp_rtol"
+        raise SolverError(
+            f"{name}: no convergence after {ksp.getIterationNumber()} iterations "
+            f"(PETSc reason {ksp.getConvergedReason()}); {advice}"
+        )
+
+
+class AskedSolver:
+    """A solver that the user's options may have made an iteration, in the place of a factor.
+
+    Args:
+        ksp: the solver; stays with its owner.
+    """
+
+    def __init__(self, ksp: PETSc.KSP) -> None:
+        self.ksp, self.createVecs = ksp, ksp.getOperators()[0].createVecs
+
+    def solve(self, r: PETSc.Vec, w: PETSc.Vec) -> None:
+        """Solve S w = r. Collective where the solver is. Raises SolverError: the iteration does not converge."""
+        solve_checked(self.ksp, r, w, self.ksp.getPC().getType())
+
+    def matSolve(self, B: PETSc.Mat, X: PETSc.Mat) -> None:  # noqa: N802  (PETSc's name, as a factor has it)
+        """Solve S X = B for dense columns. Collective. Raises SolverError: the iteration does not converge."""
+        self.ksp.matSolve(B, X)
+        if self.ksp.getConvergedReason() < 0:
+            raise SolverError(
+                f"{self.ksp.getPC().getType()}: no convergence for {B.getSize()[1]} columns; change the PETSc options "
+                f"-{self.ksp.getOptionsPrefix()}*, such as a larger ksp_max_it or ksp_rtol"
+            )
+
+
+def direct_solves(ksp: PETSc.KSP) -> PETSc.Mat | AskedSolver:
+    """The factor of a solver, whose own solves skip its checks; the solver itself where the user gave options."""
+    return AskedSolver(ksp) if user_options(ksp.getOptionsPrefix()) else ksp.getPC().getFactorMatrix()
 
 
 def _factored(ksp: PETSc.KSP) -> bool:
@@ -190,12 +235,12 @@ class OrderedFactor:
     One gather a solve; every rank solves for all rows and keeps its own.
 
     Args:
-        factor: of the permuted matrix; stays with its solver.
+        factor: of the permuted matrix (:func:`direct_solves`); stays with its solver.
         order: of its rows.
         like: a vector with the distribution of those to come.
     """
 
-    def __init__(self, factor: PETSc.Mat, order: NodeOrder, like: PETSc.Vec) -> None:
+    def __init__(self, factor: PETSc.Mat | AskedSolver, order: NodeOrder, like: PETSc.Vec) -> None:
         self.factor, self.order = factor, order
         self.comm = like.comm.tompi4py()
         first, last = like.owner_range

@@ -1,7 +1,7 @@
 """Model of time and memory of each solver by the number of unknowns and ranks.
 
 `python -m benchmarks solvers` measures set-up and solves of every row and prints measured over modelled times;
-`python -m benchmarks scale` does so for whole runs and on ranks. Of work that p ranks share each takes 1 / p and some
+`python -m benchmarks scale` does so for whole runs and on ranks. Of work that p ranks share each does 1 / p and some
 for the seams, like (n / p)^(-1/d); of a factor p^-0.62 of the time of one.
 """
 
@@ -25,7 +25,7 @@ STEP_RTOL = {"cg": 1e-8, "stars": 1e-4}
 # Iterations of a step from the last solutions, over those from zero to 1e-8 [1].
 GUESSED = {"cg": 0.6, "stars": 0.3}
 GRADED = 2.5  # iterations on lines that crowd over those on even cells [1]: cg 2.2 to 2.6, stars 2.8
-DAMPED = 0.5  # share of these iterations that damped steps take, for the last solutions tell more of the next [1]
+DAMPED = 0.5  # share of these iterations that damped steps need, for their last solutions predict the next better [1]
 FEW_SOLVES = 20  # solves of an equilibrium, a mesh estimate or modes with one factor [1]
 PARALLEL = 0.62  # exponent p of the time ranks^-p of a factor spread over ranks [1]: 0.65 on two ranks, measured
 SEAMS = {2: 0.1, 3: 0.32}  # share of work at the seams between ranks of 1e5 unknowns each, by dimension [1]
@@ -35,8 +35,8 @@ BUILD = {(2, 1): 3.5e-6, (2, 2): 1.7e-5, (2, 3): 5.4e-5, (2, 4): 2e-4,
          (3, 1): 7e-6, (3, 2): 9e-5, (3, 3): 6.7e-4, (3, 4): 3.5e-3}  # fmt: skip
 ENTRIES = {(2, 1): 14, (2, 2): 23, (2, 3): 34, (2, 4): 46, (3, 1): 40, (3, 2): 77, (3, 3): 123, (3, 4): 198}
 PER_ENTRY = 1e-9  # time of an entry in a product [s]
-# Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. On two ranks a spread one
-# takes 0.68 and 0.65 of the time for solve and set-up at 2e4 unknowns in 3D; a whole one on each 1.4 and 1.2, and the
+# Unknowns times ranks up to which every rank stores the whole factor of MUMPS, and ranks. On two ranks a spread one
+# needs 0.68 and 0.65 of the time for solve and set-up at 2e4 unknowns in 3D; a whole one on each 1.4 and 1.2, and the
 # memory of one for each, the price of the same bits. In 2D blocks on every rank beat any spread factor to 2e5.
 REPEATED_LIMIT = {2: 1_000_000, 3: 40_000}
 REPEATED_RANKS = 4
@@ -44,7 +44,7 @@ REPEATED_RANKS = 4
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of one solver on elements of one kind, on one core."""
+    """Modelled time of one solver on elements of one kind, on one core."""
 
     setup: Power  # time of the set-up [s]
     pass_: Power  # time of a solve by a factor, or of one iteration [s]
@@ -89,7 +89,7 @@ class Work:
     contrast: float  # largest lambda / mu of the materials [1]
     reproducible: Reproducible = "auto"  # time.reproducible of the scene
     graded: bool = False  # whether cells crowd, so that they are flat and iterations more
-    damped: bool = False  # whether steps are damped, so that the last solutions tell more of the next
+    damped: bool = False  # whether steps are damped, so that the last solutions predict the next better
 
     def repeated(self, name: SolverName) -> bool:
         """Whether every rank factors by itself: no message in a solve, and the same bits in every run.
@@ -148,9 +148,9 @@ class Work:
         return min(self.candidates(), key=self.memory)
 
     def choose(self, memory: float = np.inf) -> list[SolverName]:
-        """Candidates whose set-up and factor take at most so much over all ranks [byte], the fastest first.
+        """Candidates whose set-up and factor need at most so much over all ranks [byte], the fastest first.
 
-        Where none does it is the one that takes the least.
+        Where none does it is the one that needs the least.
         """
         fits = [name for name in self.candidates() if self.memory(name) <= memory]
         return sorted(fits or [self.leanest()], key=self.seconds)
@@ -162,24 +162,24 @@ class Work:
     def reason(self, requested: str = "auto", memory: float = np.inf) -> str:
         """The reason of that choice in words."""
         if requested != "auto":
-            return "asked for by the scene"
+            return "requested by the scene"
         best, *others = self.choose(memory)
         text = f"about {self.seconds(best):.2g} s for set-up and {self.solves} solves of n_e = {self.n:.0f}"
         return text + (f" by the cost model, {others[0]} {self.seconds(others[0]):.2g} s" if others else "")
 
     def price_of_bits(self, name: SolverName) -> str:
-        """What it costs that each rank holds the whole factor, in words; empty where another way is not quicker."""
+        """Time that a spread factor would save, in words; empty where each rank storing the whole one is as quick."""
         spread = replace(self, reproducible=False)
         if name == "cholesky" or not self.repeated(name) or spread.seconds(name) > self.seconds(name):
             return ""
         return (
-            f"; each of the {self.ranks} ranks holds the whole factor, for the same bits in every run: with "
+            f"; each of the {self.ranks} ranks stores the whole factor, for the same bits in every run: with "
             f"time.reproducible = false about {spread.seconds(name):.2g} instead of {self.seconds(name):.2g} s"
         )
 
     @property
     def _kind(self) -> int:
-        return 2 if self.dimension < 3 else 3  # systems without a mesh cost like those in 2D
+        return 2 if self.dimension < 3 else 3  # systems without a mesh count as those in 2D
 
     def _cost(self, name: SolverName) -> Cost:
         return COSTS[name, self._kind, self.order > 1 or name == "stars"]
@@ -189,7 +189,7 @@ class Work:
         return float(value * (self.n / 1e5) ** exponent)
 
     def _time(self, power: Power, name: SolverName) -> float:
-        """Time on these ranks, but for messages [s]; what iterations take of an unknown grows with a rank's share."""
+        """Time on these ranks without messages [s]; that of an iteration for an unknown grows with a rank's share."""
         if self.repeated(name):
             return self._at(power)
         if name not in ITERATIVE:
@@ -197,7 +197,7 @@ class Work:
         return replace(self, n=self.n / self.ranks)._at(power) * self.ranks * seams(self.n, self._kind, self.ranks)
 
     def _waits(self, name: SolverName) -> float:
-        """Time that messages of one pass take at least [s]."""
+        """Least time of the messages of one pass [s]."""
         return 0.0 if self.repeated(name) else self._cost(name).messages * math.log2(self.ranks) * MESSAGE
 
 

@@ -1,7 +1,7 @@
 """A first guess for S w = r from the last solutions, the best in their span [F98].
 
 With W the last w's, w_0 = W c minimises |w_0 - S^-1 r| in the norm of S where (W'S W) c = W'r; the product S w comes
-with each solve, so that a guess takes vectors only.
+with each solve, so that a guess needs vectors only.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ from mpi4py import MPI
 from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, PETSc
+from softgrasp.fem.petsc import Array, PETSc, from_options
 from softgrasp.fem.solve.solvers import ITERATIVE, TissueSolver, choose_solver
 from softgrasp.fem.solve.stiffness import factored_stiffness
 from softgrasp.fem.system import BlockSystem
@@ -24,7 +24,7 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
 
     Krylov-Schur on K_ee^-1 M_ee (shift-and-invert at 0, one Cholesky factor). A second run in the M-orthogonal
     complement catches copies of multiple eigenvalues that one Krylov space cannot see. The sign of a mode does not
-    depend on the rank count. What was computed stays with the system: whoever asks for fewer takes of it. Collective.
+    depend on the rank count. Modes stay with the system: a later call for fewer returns the first of them. Collective.
 
     ``k``: number of modes, 1 <= k <= n_e.
 
@@ -35,13 +35,13 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
     """
     n_e = system.layout.n_e
     if not 1 <= k <= n_e:
-        raise SolverError(f"{k} modes are asked for; it must be between 1 and n_e = {n_e}")
+        raise SolverError(f"{k} modes are requested; it must be between 1 and n_e = {n_e}")
     key = (system.K_ee.handle, system.K_ee.stateGet(), system.M_ee.handle, system.M_ee.stateGet())
     kept = system.kept.get("modes")
     if kept is None or kept[0] != key or len(kept[1]) < k:
         name = choose_solver(system.layout, few=True)[0]  # as for static solves, whose factor is this one
         with factored_stiffness(system, "mumps" if name in ITERATIVE else name) as solver:
-            kept = key, *_lowest(system, solver, k), system.K_ee, system.M_ee  # none else can take their handles
+            kept = key, *_lowest(system, solver, k), system.K_ee, system.M_ee  # no other can get their handles
         if system.M_ee.getType() != PETSc.Mat.Type.PYTHON and k * n_e <= KEPT_ENTRIES:
             system.kept["modes"] = kept
     return kept[1][:k].copy(), kept[2][:, :k].copy(order="F")
@@ -101,7 +101,7 @@ def _make_eps(system: BlockSystem, solver: TissueSolver) -> SLEPc.EPS:
     eps.setType(SLEPc.EPS.Type.KRYLOVSCHUR)
     eps.setWhichEigenpairs(SLEPc.EPS.Which.TARGET_MAGNITUDE)
     eps.setTarget(0.0)
-    eps.setPurify(False)  # for singular M_ee; costs one solve a mode
+    eps.setPurify(False)  # for singular M_ee; needs one solve a mode
     st = eps.getST()
     st.setType(SLEPc.ST.Type.SINVERT)
     ksp = st.getKSP()
@@ -109,6 +109,7 @@ def _make_eps(system: BlockSystem, solver: TissueSolver) -> SLEPc.EPS:
     pc = ksp.getPC()
     pc.setType("python")
     pc.setPythonContext(_Factored(solver))
+    from_options(eps)
     return eps
 
 
@@ -140,7 +141,7 @@ def _solve(
     if eps.getConverged() < k:
         raise SolverError(
             f"modes: {eps.getConverged()} of {k} converged in {eps.getIterationNumber()} iterations "
-            f"(SLEPc reason {int(eps.getConvergedReason())}); ask for fewer modes or check the mesh"
+            f"(SLEPc reason {int(eps.getConvergedReason())}); request fewer modes or check the mesh"
         )
     for i in range(k):
         vector = system.K_ee.createVecRight()

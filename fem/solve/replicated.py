@@ -74,7 +74,7 @@ def replicated_operators(
     first, last = layout.start, layout.start + layout.n_local
     if not (whole or ordered):
         K = system.K_ee.copy()
-        if K.comm.size == 1:  # the conversion of a parallel matrix takes its source apart
+        if K.comm.size == 1:  # the conversion of a parallel matrix destroys its source
             K.convert("baij")
         G, M = np.asfortranarray(system.G), None if D is None else system.M_ee
         return ReplicatedOperators(layout, False, None, slice(0, layout.n_local), K, G, S, D, M, parts)

@@ -9,14 +9,17 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, PETSc, petsc_options, total, whole_copy
+from softgrasp.fem.petsc import Array, PETSc, from_options, petsc_options, total, user_options, whole_copy
 from softgrasp.fem.solve.cholesky import (
     VANISHING_PIVOT,
+    AskedSolver,
     NodeOrder,
     OrderedFactor,
+    direct_solves,
     dissect,
     factor_blocks,
     make_ksp,
+    solve_checked,
 )
 from softgrasp.fem.solve.costs import FEW_SOLVES, Work
 from softgrasp.fem.solve.costs import ITERATIVE as ITERATIVE
@@ -27,15 +30,16 @@ from softgrasp.fem.solve.stars import Stars, factored
 # Largest problem whose single entries PETSc's own Cholesky factors faster than MUMPS, where blocks lose digits.
 FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}  # 1: systems without a mesh
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}  # above, the factor itself does not fit
-# Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,
+# Below 1e-8 the residual needs no second look. Above, it proves little: a backward stable solve has eps |S| |w| / |r|,
 # which grows with the condition though w may be right. One step of refinement measures the error of w itself.
 DIRECT_RESIDUAL = 1e-8
 DIRECT_ERROR = 1e-6
 OUT_OF_MEMORY = 3  # PC_FACTOR_OUTMEMORY
 # Percent beyond the estimate that MUMPS reserves on each rank. With PETSc's 20 one of four set-ups on two ranks of a
-# busy machine failed, for a cause that was not found; pages that are not touched cost nothing.
+# busy machine failed, for a cause that was not found; pages that are not touched need no memory.
 WORKSPACE = 100
 PACKAGES = {"petsc": "PETSc", "mumps": "MUMPS"}  # PETSc's names of those that factor
+FACTORS = ("cholesky", "lu")  # PETSc's names of direct preconditioners
 
 
 class SolverUsed(NamedTuple):
@@ -60,7 +64,7 @@ def choose_solver(
         few: some static solves with one factor, not the steps of a run.
         contrast: largest lambda / mu, which iterations grow with.
         steps: of the run.
-        memory: that set-up and factor may take, over all ranks [byte].
+        memory: that set-up and factor may use, over all ranks [byte].
     """
     work = work_of(layout, FEW_SOLVES if few else steps, few, contrast)
     return work.solver(requested, memory), work.reason(requested, memory)
@@ -76,6 +80,12 @@ def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: 
     return work_of(layout, 1, False, 1.0, reproducible).repeated(solver)
 
 
+def package_of(pc: PETSc.PC) -> str:
+    """Package that factors, or the preconditioner where none does, as PETSc reports it."""
+    by = pc.getFactorSolverType() if pc.getType() in FACTORS else pc.getType().upper()
+    return PACKAGES.get(by, str(by))
+
+
 @dataclass(frozen=True)
 class TissueSolver:
     """A factored (or preconditioned) symmetric positive definite matrix of the tissue block."""
@@ -86,20 +96,27 @@ class TissueSolver:
     tolerance: float  # largest relative residual that ``check`` accepts [1]
     # factor that solves without ``ksp``: whole on every rank, perhaps in an order of its own
     # (softgrasp.fem.solve.cholesky), or that of one rank; None where the factor is spread or there is none
-    factor: PETSc.Mat | OrderedFactor | None = None
+    factor: PETSc.Mat | AskedSolver | OrderedFactor | None = None
     stars: Stars | None = None  # preconditioner of solver "stars", which owns S; else None
 
     @property
     def package(self) -> str:
         """Package of the factor, as PETSc reports it, or of the preconditioner."""
-        pc = self.ksp.getPC()
-        if self.stars is not None:
+        if self.stars is not None and self.stars.package:
             return f"stars, {self.stars.package}"
-        return str(pc.getType().upper() if self.name == "cg" else PACKAGES[pc.getFactorSolverType()])
+        return package_of(self.ksp.getPC())
+
+    @property
+    def entries(self) -> float | None:
+        """Nonzero entries of the factor, as PETSc counts them; None where there is none. Collective."""
+        pc = self.ksp.getPC()
+        return float(pc.getFactorMatrix().getInfo()["nz_used"]) if pc.getType() in FACTORS else None
 
     def used(self, reason: str) -> SolverUsed:
-        """This solver with the reason of its choice; single entries, which make a slower step, are added to it."""
-        if self.name == "cholesky" and "sbaij" not in self.ksp.getOperators()[0].getType():
+        """This solver with the reason of its choice; to it are added the user's options, or single entries (slower)."""
+        if asked := user_options(self.ksp.getOptionsPrefix()):
+            reason += f"; with the PETSc options -{', -'.join(asked)}"
+        elif self.name == "cholesky" and "sbaij" not in self.ksp.getOperators()[0].getType():
             reason += f"; in single entries by {self.package}, since blocks would lose digits here"
         return SolverUsed(self.name, reason, self.package)
 
@@ -111,23 +128,18 @@ class TissueSolver:
         if self.factor is not None:
             self.factor.solve(r, w)
             return
-        self.ksp.solve(r, w)
-        if self.ksp.getConvergedReason() < 0:
-            raise SolverError(
-                f"{self.name}: no convergence after {self.ksp.getIterationNumber()} iterations "
-                f"(PETSc reason {self.ksp.getConvergedReason()}); choose time.solver = 'mumps' or a larger time.rtol"
-            )
+        solve_checked(self.ksp, r, w, self.name)
 
     def columns(self, X: Array, where: str = "") -> Array:
         """S^-1 X of local rows (n_local, k), Fortran order; checked as :meth:`check` does if ``where`` is given.
 
-        Columns of zeros cost nothing. Collective.
+        Columns of zeros are not solved. Collective.
         """
         r, w = self.S.createVecs()
         result = np.zeros(X.shape, order="F")
         some = np.flatnonzero(total(self.S.comm.tompi4py(), np.abs(X).sum(axis=0)) != 0)
         divided = isinstance(self.factor, OrderedFactor)
-        if isinstance(self.factor, OrderedFactor):  # each rank holds the whole factor
+        if isinstance(self.factor, OrderedFactor):  # each rank stores the whole factor
             result[:, some] = self.factor.columns(X[:, some])
         try:
             for j in some:
@@ -262,16 +274,15 @@ def make_solver(
         ksp.setType("preonly")
         ksp.getPC().setType("cholesky")
         ksp.getPC().setFactorSolverType("mumps")
-        if S.comm.size > 1:
-            ksp.getPC().setFactorSetUpSolverType()
-            ksp.getPC().getFactorMatrix().setMumpsIcntl(14, WORKSPACE)
+        from_options(ksp)
     try:
-        _factor(ksp, S, name)
+        with petsc_options(prefix, {"mat_mumps_icntl_14": WORKSPACE} if name == "mumps" and S.comm.size > 1 else {}):
+            _factor(ksp, S, name)
     except SolverError:
         ksp.destroy()
         S.destroy()
         raise
-    factor = ksp.getPC().getFactorMatrix() if name != "cg" and ksp.comm.size == 1 else None
+    factor = direct_solves(ksp) if name != "cg" and ksp.comm.size == 1 else None
     return TissueSolver(name, ksp, S, tolerance, factor)
 
 
@@ -292,7 +303,7 @@ def _repeated(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float) 
 def _gathered(ksp: PETSc.KSP, order: NodeOrder, S: PETSc.Mat) -> OrderedFactor:
     """The factor of one rank alone for vectors distributed as those of S. Collective."""
     like = S.createVecLeft()
-    factor = OrderedFactor(ksp.getPC().getFactorMatrix(), order, like)
+    factor = OrderedFactor(direct_solves(ksp), order, like)
     like.destroy()
     return factor
 
@@ -313,8 +324,8 @@ def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, 
         raise
     finally:
         if P is not S:
-            P.destroy()  # the ksp holds what it needs
-    factor = ksp.getPC().getFactorMatrix() if order is None else _gathered(ksp, order, S)
+            P.destroy()  # the ksp owns what it needs
+    factor = direct_solves(ksp) if order is None else _gathered(ksp, order, S)
     return TissueSolver("cholesky", ksp, S, tolerance, factor)
 
 
@@ -329,7 +340,7 @@ def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
         ) from error
     reason = ksp.getPC().getFailedReason()
     if reason:
-        why = "out of memory or workspace; take more ranks" if reason == OUT_OF_MEMORY else "the matrix is not definite"
+        why = "out of memory or workspace; use more ranks" if reason == OUT_OF_MEMORY else "the matrix is not definite"
         raise SolverError(f"{name}: set-up failed (reason {reason}); {why}")
 
 
@@ -337,9 +348,7 @@ def _stars(S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float, toleranc
     """CG with multigrid over vertex stars; flexible where the linear elements are iterated upon. Collective."""
     if layout.patches is None:
         S.destroy()
-        raise SolverError(
-            "stars: linear elements have no stars to smooth over; take tissue.order = 2 or another solver"
-        )
+        raise SolverError("stars: linear elements have no stars to smooth over; use tissue.order = 2 or another solver")
     ksp = PETSc.KSP().create(S.comm)
     ksp.setOptionsPrefix(prefix)
     ksp.setType("cg" if factored(layout) else "fcg")

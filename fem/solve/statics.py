@@ -8,7 +8,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, PETSc
+from softgrasp.fem.petsc import Array, PETSc, from_options
 from softgrasp.fem.scene.scene import Time
 from softgrasp.fem.solve.solvers import SolverName, TissueSolver, choose_solver, make_solver
 from softgrasp.fem.solve.stiffness import factored_stiffness
@@ -22,7 +22,7 @@ def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Tim
     """Static displacement relative to the hand, K_ee z = G g or f(z) = G g; local rows (n_local,) [m]. Collective.
 
     Args:
-        solver: None takes the one that suits few solves.
+        solver: its name; None: the one that suits few solves.
         time: for the reproducibility of the scene.
 
     Raises:
@@ -42,7 +42,7 @@ def solve_columns(
 ) -> Array:
     """Return the local rows (n_local, k) of A^-1 X, A symmetric positive definite, Fortran order. Collective.
 
-    Factored once; columns of zeros cost nothing.
+    Factored once; columns of zeros are not solved.
 
     ``rtol``: of cg, where no direct solver fits. Raises SolverError: the factorisation fails, or the solution has a
     large residual.
@@ -68,6 +68,7 @@ def mass_columns(system: BlockSystem, X: Array) -> Array:
     ksp.getPC().setType("jacobi")
     ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
     ksp.setTolerances(rtol=MASS_RTOL, atol=1e-300, max_it=1000)
+    from_options(ksp)
     solver = TissueSolver("cg", ksp, M.copy(), 10 * MASS_RTOL)
     try:
         return solver.columns(X, "a momentum")
@@ -109,7 +110,7 @@ def finite_equilibrium(system: BlockSystem, solver: SolverName | None = None) ->
             J, place = body.lowest(1 + body.start(z).j, comm)
             raise SolverError(
                 f"finite strain ({body.law.name}): no equilibrium beyond {t:.3g} of the weight; in the cell at {place} "
-                f"det F = {J:.3g}: take a stiffer material, or time.start = 'rest'"
+                f"det F = {J:.3g}: use a stiffer material, or time.start = 'rest'"
             )
     body.refuse(body.start(z), comm)
     for item in (z, f, load):

@@ -75,7 +75,7 @@ def factored_stiffness(
     """K_ee, factored (or the set-up of cg and stars) on the first request, and kept while it is small. Collective.
 
     Args:
-        solver: None takes the one that suits few solves.
+        solver: its name; None: the one that suits few solves.
         rtol: of cg and stars, where no direct solver fits.
 
     Raises SolverError: the factorisation fails.
@@ -96,7 +96,7 @@ def factored_stiffness(
     if layout.n_e <= KEPT_LIMIT[layout.dimension] and (everywhere or layout.comm.size == 1):
         if kept is not None:
             kept[1].destroy()
-        system.kept["factor"] = key, make(), K  # no other matrix can take the handle of one that is held
+        system.kept["factor"] = key, make(), K  # no other matrix can get the handle of one that is referenced
         yield system.kept["factor"][1]
         return
     with shared_factor(system, "stiffness", key, make) as factor:
@@ -104,7 +104,7 @@ def factored_stiffness(
 
 
 def static_columns(system: BlockSystem, X: Array) -> Array:
-    """K_ee^-1 X of local rows (n_local, k), Fortran order; columns of zeros cost nothing. Collective.
+    """K_ee^-1 X of local rows (n_local, k), Fortran order; columns of zeros are not solved. Collective.
 
     Raises SolverError: the factorisation fails, or the solution has a large residual.
     """

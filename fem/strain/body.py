@@ -168,7 +168,7 @@ class HyperelasticBody:
             f"det F = {J:.3g} in the cell at {place}" if J <= 0 else f"a stretch of {least:.3g} in the cell at {where}"
         )
         raise SolverError(
-            f"finite strain ({self.law.name}): {text}, where the law describes no solid; take "
+            f"finite strain ({self.law.name}): {text}, where the law describes no solid; use "
             "effects.finite_strain.law = 'neo-hooke', a gentler motion or a stiffer material"
         )
 

@@ -17,13 +17,16 @@ from pathlib import Path
 from typing import Any
 
 LAWS = Path(__file__).parent  # of law.h, which every source includes
-LANES = 8  # points that the C code takes at a time
+LANES = 8  # points that the C code treats at a time
 FLAGS = (f"-DLANES={LANES}", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 
 
 @functools.cache
 def library(source: Path, declaration: str, otherwise: str) -> Any:
-    """(ffi, library) of a source, or None with a warning, what is done ``otherwise``, where it cannot be compiled."""
+    """(ffi, library) of a C source; None, with a warning, where it cannot be compiled.
+
+    ``declaration``: of its functions, for cffi; ``otherwise``: the way that is used instead, begins the warning.
+    """
     try:
         from cffi import FFI  # it comes with FFCx, not with every online machine
 
@@ -43,7 +46,7 @@ def library(source: Path, declaration: str, otherwise: str) -> Any:
 
 
 def _shared(source: Path) -> Path:
-    """The shared library in the cache folder, made there unless it is there; its name says source and machine."""
+    """The shared library in the cache folder, made there unless it is there, named by hashes of source and machine."""
     compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
         raise OSError("there is no C compiler")

@@ -14,7 +14,7 @@ mu/2 |F|^2 + g(J), and J is quadratic or cubic in F, so
     P = mu F_m + gbar C,   gbar = (g(J_1) - g(J_0)) / (J_1 - J_0),   C = Cof F_m [+ Cof(grad w) / 3 in 3D],
 
 where C : (F_1 - F_0) = J_1 - J_0 exactly and gbar is smooth at J_1 = J_0: log1p(x)/x is right to rounding however small
-x = (J_1 - J_0)/J_0 is. St. Venant-Kirchhoff takes P = F_m C:(E_0 + E_1)/2 [ST92].
+x = (J_1 - J_0)/J_0 is. St. Venant-Kirchhoff has P = F_m C:(E_0 + E_1)/2 [ST92].
 """
 
 from __future__ import annotations

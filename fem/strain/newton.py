@@ -11,7 +11,7 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array
 
-PAIRS = 4  # on 60 x 120 cells 2 cost more iterations, 12 save none
+PAIRS = 4  # on 60 x 120 cells 2 need more iterations, 12 save none
 MOST = 40  # largest number of iterations [1]
 RENEW = 8  # iterations after which the tangent is factored anew [1]
 SMALLEST = 2.0**-10  # smallest fraction of a correction [1]

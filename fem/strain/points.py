@@ -81,7 +81,7 @@ def whole_points(points: QuadraturePoints, comm: MPI.Intracomm, columns: Ints | 
     every.destroy()
     counts, d = comm.allgather(len(points.vol)), points.d
     firsts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    # rank by rank the rows stand component by component; on one rank all points of a component stand together
+    # rank by rank the rows are ordered by component; on one rank all points of a component are together
     rows = [
         d * d * first + component * count + np.arange(count)
         for component in range(d * d)

@@ -18,6 +18,7 @@ import scipy.linalg
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.constrained.tissue import ModalTissue
+from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 
@@ -65,7 +66,7 @@ def held(A: Array, B: Array, s: float) -> tuple[Array, Array]:
 
 
 def held_plant(problem: RiccatiProblem, tissue: ModalTissue, grid: float, parts: int) -> HeldPlant:
-    """Gain and cost of the plant with a reduced tissue. Raises LinAlgError: no gain stabilises it."""
+    """Gain and cost of the plant with a reduced tissue. Raises ControlError: none is found on this grid."""
     n_s, k = problem.layout.n_s, len(tissue.omega)
     N = 2 * (n_s + k)
     q, v, z, w = slice(n_s), slice(n_s, 2 * n_s), slice(2 * n_s, 2 * n_s + k), slice(2 * n_s + k, N)
@@ -77,9 +78,15 @@ def held_plant(problem: RiccatiProblem, tissue: ModalTissue, grid: float, parts:
     C = np.zeros((len(problem.Q), N))
     C[:, q], C[:, z] = problem.C_s, tissue.c
     A_d, B_d = held(A, B, grid)
-    W = held_cost(A, B, scipy.linalg.block_diag(C.T @ problem.Q @ C, problem.R), grid)
+    with np.errstate(over="ignore", invalid="ignore"):  # refused below
+        W = held_cost(A, B, scipy.linalg.block_diag(C.T @ problem.Q @ C, problem.R), grid)
     Q_d, S_d, R_d = W[:N, :N], W[:N, N:], W[N:, N:]
-    P = scipy.linalg.solve_discrete_are(A_d, B_d, Q_d, R_d, s=S_d)
+    try:
+        P = scipy.linalg.solve_discrete_are(A_d, B_d, Q_d, R_d, s=S_d)
+    except ValueError as error:  # not finite, not definite, or LinAlgError: no solution
+        raise ControlError(
+            f"no gain is found for forces held over {grid:g} s ({error}); lower control.constraints.grid"
+        ) from None
     weight = R_d + B_d.T @ P @ B_d
     K = -np.linalg.solve(weight, B_d.T @ P @ A_d + S_d.T)
     return HeldPlant(A, B, Y, grid, parts, (P + P.T) / 2, K, np.linalg.inv(np.linalg.cholesky(weight)).T, tissue)

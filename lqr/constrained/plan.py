@@ -12,8 +12,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.obstacles.shapes import HalfSpace, Shape
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.resources import free_memory, size_text
 from softgrasp.lqr.constrained.horizon import HeldPlant, Horizon
 from softgrasp.lqr.constrained.least_distance import InfeasibleError, nearest, nearest_soft
 from softgrasp.lqr.constrained.rows import Limits, bends, both_ends, broken, follow, gap_rows, limit_rows, tail_level
@@ -26,7 +28,8 @@ ROOM = 1.05  # of the bends of the last round that the next one keeps
 MOST_WAYS = 8  # sides of obstacles that are tried
 LONGEST = 4  # times the first horizon
 MOST_FOLLOWED = 5000  # intervals behind the horizon that are followed
-PRICE = 10.0  # of a metre inside an obstacle, over the mean cost of a metre of the way
+COPIES = 7  # of the rows, at the peak of a program that may exceed its gaps; 3.5 of one that keeps them
+PRICE = 20.0  # of a metre inside an obstacle, over the mean cost of a metre of the way
 SLIGHT = 1e-10  # [m]: a slack that is rounding of the price
 TIGHT = 1e-9  # of the extent of the body [1]: a row so near to its bound holds the plan
 
@@ -57,7 +60,7 @@ class Plan:
     normals: Array  # of the half-plane of every obstacle and interval, (obstacles, H, 2)
     slack: Array  # depth inside clearance and margin, by obstacle and interval [m], (obstacles, H)
     bend: float  # largest bound on what a node that holds the plan does between two instants [m]
-    multiplier: float  # largest cost of a metre of one row [1/m]
+    multiplier: float  # largest dJ of a metre of one gap at one instant, twice its multiplier in |c|^2 / 2 [1/m]
     active: tuple[int, ...]  # rows that hold the plan, empty where gaps are not kept
     costs: tuple[float, ...]  # |c|^2 of the rounds
     steps: int  # changes of the active set in all rounds
@@ -130,19 +133,33 @@ def make_plan(plant: HeldPlant, task: Task, steps: int, longest: int | None = No
         steps: intervals of the first horizon.
         longest: intervals of the last one; None for :data:`LONGEST` times the first.
 
-    Raises ControlError: the target keeps no gap or limit, or the limits of the hand cannot be kept.
+    Raises:
+        ControlError: the target keeps no gap or limit, or the limits of the hand cannot be kept.
+        ResourceError: the quadratic program does not fit in the memory that is free now.
     """
     level = tail_level(plant, _at_target(task), task.limits, task.u_bar)
     if not level > 0:
-        raise ControlError("the target holds the hand beyond its own limit of force; raise control.constraints.force")
+        raise ControlError("the steady force at the target is not below its limit; raise control.constraints.force")
     if longest is None:
         longest = LONGEST * steps
         _check_in_time(plant, task, longest * plant.grid)
     while True:
+        _check_memory(plant, task, steps)
         plan = _cheapest(Horizon(plant, steps), task, level)
         if not plan.unsafe or steps >= longest:
             return plan
         steps = min(longest, steps + plan.unsafe)
+
+
+def _check_memory(plant: HeldPlant, task: Task, steps: int) -> None:
+    """Raises ResourceError where the rows of a horizon do not fit; they grow with the square of its intervals."""
+    rows = (plant.parts + 1) * (len(task.shapes) * len(task.places) + plant.N) + 6 * plant.n_s  # of an interval
+    needed, free = COPIES * 8.0 * rows * plant.n_s * float(steps) ** 2, free_memory()
+    if needed > free:
+        raise ResourceError(
+            f"a plan of {steps:.6g} intervals would take about {size_text(needed)} of memory, and {size_text(free)} is "
+            "free; lower control.constraints.horizon or parts, or raise control.constraints.grid"
+        )
 
 
 def _check_in_time(plant: HeldPlant, task: Task, longest: float) -> None:
@@ -169,8 +186,8 @@ def _at_target(task: Task) -> list[tuple[Array, Array]]:
         if not free.min() > 0:
             need = gap - float(free.min())
             raise ControlError(
-                f"at the target the body stands {gap:.4g} m off obstacle {name}; a plan needs more than {need:.4g} m "
-                "there, clearance and the bound of the reduced plant; move motion.target or raise control.constraints.N"
+                f"at the target the gap to obstacle {name} is {gap:.4g} m and a plan needs more than {need:.4g} m, for "
+                "clearance and the bound of the reduced plant; move motion.target or raise control.constraints.N"
             )
         result.append((normal, free))
     return result
@@ -221,7 +238,7 @@ def _rounds(horizon: Horizon, task: Task, normals: Array, level: float, sides: t
     for _ in range(ROUNDS):
         G, h, group = _rows(horizon, task, normals, c)
         c, slack, multipliers, active, more = _solve(G, h, group, hard, active, _price(horizon, task))
-        steps, slack = steps + more, slack.reshape(len(normals), -1)
+        steps, slack = steps + more, slack.reshape(len(normals), horizon.steps)
         costs.append(float(c @ c))
         plan = _judged(horizon, task, c, normals, slack, multipliers, level)
         plan = replace(plan, active=active, sides=sides)
@@ -276,19 +293,19 @@ def _rows(horizon: Horizon, task: Task, normals: Array, c: Array) -> tuple[Array
 def _solve(
     G: Array, h: Array, group: NDArray[np.int64], hard: tuple[Array, Array], active: tuple[int, ...], price: float
 ) -> tuple[Array, Array, Array, tuple[int, ...], int]:
-    """Hard rows, and where no c keeps them soft ones: c, slack, multipliers, active rows, steps."""
+    """Hard rows, and where no c keeps them soft ones: c, slack, multipliers of the gaps, active rows, steps."""
     count = int(group.max(initial=-1)) + 1
     try:
         found = nearest(np.vstack([G, hard[0]]), np.concatenate([h, hard[1]]), active)
-        return found.x, np.zeros(count), found.multipliers, found.active, found.steps
+        return found.x, np.zeros(count), found.multipliers[: len(h)], found.active, found.steps
     except InfeasibleError:
         try:
-            soft = nearest_soft(G, h, group, hard, price)
+            soft = nearest_soft(G, h, group, hard, price / 2)  # which has |c|^2 / 2
         except InfeasibleError:
             raise ControlError(
                 "no plan keeps the limits of the hand; raise force, speed or jump of control.constraints"
             ) from None
-        return soft.x, np.where(soft.slack > SLIGHT, soft.slack, 0.0), soft.multipliers, (), soft.steps
+        return soft.x, np.where(soft.slack > SLIGHT, soft.slack, 0.0), soft.multipliers[: len(h)], (), soft.steps
 
 
 def _judged(
@@ -318,6 +335,6 @@ def _judged(
     if task.limits.jump is not None and (np.abs(plant.K @ x[-1, -1] - u[-1]) > task.limits.jump).any():
         more = len(u) - H + 1  # the first interval of the tail
     return Plan(
-        horizon, task, c, normals, slack, bend, float(multipliers.max(initial=0.0)), (),
+        horizon, task, c, normals, slack, bend, 2 * float(multipliers.max(initial=0.0)), (),
         (), 0, (), (), 0, gap, len(u) - H, more,
     )  # fmt: skip

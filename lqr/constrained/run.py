@@ -10,7 +10,6 @@ import scipy.linalg
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.constrained.plan import Plan
-from softgrasp.lqr.constrained.rows import follow
 from softgrasp.lqr.constrained.separation import separate
 from softgrasp.lqr.constrained.tissue import ModalTissue, Surface
 from softgrasp.lqr.loop.actuation import Actuation
@@ -57,15 +56,6 @@ def watching(problem: RiccatiProblem, surface: Surface) -> RiccatiProblem:
     return replace(problem, C_s=C_s, C_z=np.hstack([problem.C_z, C_z]), Q=Q, columns=())
 
 
-def plan_inputs(plan: Plan, end: float) -> Array:
-    """Inputs of every interval up to a time, behind the horizon those of the gain K, (intervals, n_s) [N]."""
-    horizon, plant = plan.horizon, plan.horizon.plant
-    F, G = horizon.states
-    count = max(int(np.ceil(end / plant.grid - 1e-9)) - horizon.steps, 0)
-    _, tail = follow(plant, F[-1] @ plan.task.start + G[-1] @ plan.c, -1.0, count)
-    return np.concatenate([plan.inputs, tail + plan.task.u_bar])
-
-
 @dataclass(frozen=True)
 class PlanRuns:
     """Plan and optimal feedback on the full plant, from the same start."""
@@ -85,10 +75,9 @@ def run_plan(
     tissue: ModalTissue,
     start: PlantState,
     target: Target,
-    end: float = 0.0,
     notify: Callable[[int, int], None] | None = None,
 ) -> PlanRuns:
-    """Run the full plant for the horizon of a plan, or longer, under its inputs and under the optimal feedback.
+    """Run the full plant for the horizon of a plan under its inputs and under the optimal feedback.
 
     Collective.
 
@@ -98,13 +87,12 @@ def run_plan(
         tissue: all modes of the plant.
         start: state at t = 0.
         target: state at rest.
-        end: shortest time of the runs [s].
         notify: called with the number of steps done and in all.
 
     Raises SolverError: a solve failed.
     """
     plant = plan.horizon.plant
-    inputs = plan_inputs(plan, end)
+    inputs = plan.inputs
     dt, each = plant.grid / (plant.parts * STEPS), plant.parts * STEPS
     steps = len(inputs) * each
     loop = ClosedLoop(watching(problem, surface), dt)

@@ -52,7 +52,7 @@ def care(A: Array, B: Array, C: Array, Q: Array, R: Array, E: Array | None = Non
     work is 25 (2n)^3 operations; memory some 20 n^2. Inputs are not changed.
 
     Args:
-        A, E: (n, n), E regular; None stands for I.
+        A, E: (n, n), E regular; None: I.
         B, C: (n, m) and (p, n).
         Q, R: (p, p), symmetric positive semidefinite, and (m, m), symmetric positive definite.
 
@@ -187,7 +187,7 @@ def block_eigenvalues(T: Array) -> Complex:
 def check_axis(hamiltonian: Array, values: Complex, stable: int) -> None:
     """No eigenvalue of the Hamiltonian matrix is on the imaginary axis to working precision.
 
-    A double eigenvalue on the axis splits by sqrt(eps), so a small real part alone says nothing: what counts is the
+    A double eigenvalue on the axis splits by sqrt(eps), so a small real part alone proves nothing: what counts is the
     distance min sigma(H - i omega I) to a matrix with an eigenvalue there.
 
     Raises ControlError: the distance is of the order of rounding.
@@ -281,7 +281,7 @@ def unreached(A: Array, B: Array) -> list[complex]:
 
 
 def _explain(A: Array, B: Array, C: Array) -> str | None:
-    """The reason, when one of the two rank tests knows it."""
+    """The reason, when one of the two rank tests finds it."""
     missed = unreached(A, B)
     if missed:
         return (
@@ -364,5 +364,5 @@ def check_seen(A: Array, G: Array, H: Array, omega: float) -> None:
     if smallest_singular_value(hamiltonian, 1j * omega) <= UNSEEN * float(np.linalg.norm(hamiltonian)):
         raise ControlError(
             f"the reduced equation of order {len(A)} has a solution by rounding alone: a mode that does not decay by "
-            "itself is not reached by the inputs or not seen by the outputs; take another order N"
+            "itself is not reached by the inputs or not seen by the outputs; use another order N"
         )

@@ -135,7 +135,7 @@ def in_energy(space: WeightedSystem, omega: Array) -> WeightedSystem:
 def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
     """The plant in all its modes, K_ee phi = omega^2 M_ee phi.
 
-    Raises SolverError: the stiffness is not positive definite: the hand does not hold the body.
+    Raises SolverError: the stiffness is not positive definite: the contact zone does not fix the body.
     """
     squares, Phi = scipy.linalg.eigh(tissue.K, tissue.M)
     _check_held(float(squares[0]), float(squares[-1]))
@@ -156,7 +156,7 @@ def modes_of_plant(problem: RiccatiProblem, k: int) -> tuple[Array, Array, Array
     key = (system.K_ee.handle, system.K_ee.stateGet(), system.M_ee.handle, system.M_ee.stateGet())
     kept = system.kept.get("dense modes")
     if kept is None or kept[0] != key or len(kept[1]) < k:
-        kept = key, *_modes_on_root(problem, k), system.K_ee, system.M_ee  # no other matrix can take their handles
+        kept = key, *_modes_on_root(problem, k), system.K_ee, system.M_ee  # no other matrix can get their handles
         system.kept["dense modes"] = kept
     Phi = kept[2][:, :k].copy(order="F")
     return kept[1][:k].copy(), Phi, times_columns(system.M_ee, Phi)
@@ -186,7 +186,7 @@ def lowest_plant(problem: RiccatiProblem, k: int) -> ModalPlant:
 
 def _check_held(lowest: float, largest: float) -> None:
     if not lowest > 1e-12 * largest:  # rounding of eigh is about n eps of the largest
-        raise SolverError(f"the stiffness has the eigenvalue {lowest:.1e}; the contact zone must hold the body")
+        raise SolverError(f"the stiffness has the eigenvalue {lowest:.1e}; the contact zone must fix the body")
 
 
 @dataclass(frozen=True)
@@ -209,7 +209,7 @@ class ModeRates:
 
     @property
     def lost(self) -> Array:
-        """Which modes double precision cannot tell from undamped ones."""
+        """Which modes double precision cannot distinguish from undamped ones."""
         return np.asarray(self.rate <= LOST * self.size)
 
     @property
@@ -345,7 +345,7 @@ class DenseRiccati:
 
 
 def spread(layout: BlockLayout, result: RiccatiSolution | None) -> RiccatiSolution:
-    """Give every rank its rows of a solution that rank 0 holds whole. Collective."""
+    """Give every rank its rows of a solution that rank 0 has whole. Collective."""
     ranges = layout.comm.gather((layout.start, layout.start + layout.n_local))
     pieces: list[RiccatiSolution] | None = None
     if result is not None and ranges is not None:

@@ -1,4 +1,4 @@
-"""E x' = A x + B u, y = C x in the paper's absolute coordinates, as other codes take it."""
+"""E x' = A x + B u, y = C x in the paper's absolute coordinates, the form of other codes."""
 
 from __future__ import annotations
 

@@ -61,6 +61,7 @@ def plan_control(design: Design, watch: Stopwatch, notify: Callable[[int, int], 
 
     Raises:
         ControlError: the plant has no plan, the target keeps no gap or limit, or a key is missing.
+        ResourceError: the quadratic program does not fit in memory.
         SolverError: a solve of the full plant failed.
     """
     plant, obstacles = design.problem, fixed_obstacles(design.model)
@@ -90,7 +91,7 @@ def plan_control(design: Design, watch: Stopwatch, notify: Callable[[int, int], 
         longest = None if given.horizon == "auto" else steps
         plan = on_root(plant.layout.comm, lambda: make_plan(on_grid, task, steps, longest))
     with watch.stage("plan run"):
-        runs = run_plan(plant, design.solution, plan, surface, tissue, design.start, design.target, 0.0, notify)
+        runs = run_plan(plant, design.solution, plan, surface, tissue, design.start, design.target, notify)
     return PlannedControl(plan, runs, surface, names)
 
 

@@ -68,7 +68,7 @@ def certified_controller(design: Design, basis: BasisGains | None, order: int | 
 
     Args:
         basis: the a-priori gains; None where there are none.
-        order: take this one; None takes the least cost up to :func:`softgrasp.lqr.design.orders.fast_order`.
+        order: N; None: that of the least cost up to :func:`softgrasp.lqr.design.orders.fast_order`.
 
     Raises NoController: no gain is certified.
     """

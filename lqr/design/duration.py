@@ -10,7 +10,7 @@ from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.plant.operators import outputs
 
 SETTLED = 6.0  # time constants of the slower hand pole after which 0.3 % of the way are left
-LONGEST = 20  # times the steps of the scene that a run without [control] may take to settle
+LONGEST = 20  # times the steps of the scene that a run without [control] may need to settle
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class LoopPlan:
 def plan(design: Design, own_end: bool) -> LoopPlan:
     """Steps of the closed loop, from the poles of the hand alone: M_s q'' = K_s [q; q'].
 
-    ``own_end``: keep the end of the scene; else take as many steps as the move needs.
+    ``own_end``: keep the end of the scene; else use as many steps as the move needs.
     """
     scene, n_s = design.model.scene, design.problem.layout.n_s
     dt, steps = scene.time_end / scene.time.steps, scene.time.steps

@@ -20,8 +20,8 @@ from softgrasp.lqr.reduced.bases import A_PRIORI, BASES, BasisFamily, make_famil
 from softgrasp.lqr.reduced.riccati import GainQuality, GainReport
 
 FAST_STATES = 8  # of the tissue, up to which a gain is offered for the control loop and re-tuned: N <= 12 in 2D
-MANY_STATES = 200_000  # above, few orders are tried: every one takes products with the full plant
-WHOLE_SPECTRUM = 500  # n_e from which all eigenvalues for every gain take seconds, so few orders are tried
+MANY_STATES = 200_000  # above, few orders are tried: every one needs products with the full plant
+WHOLE_SPECTRUM = 500  # n_e from which all eigenvalues for every gain need seconds, so few orders are tried
 FEW_ORDERS = 3
 LONGER = 3  # doublings of a run that has not settled
 
@@ -47,7 +47,7 @@ def fast_order(n_s: int) -> int:
 
 
 def orders(design: Design) -> tuple[list[int], str]:
-    """Orders to try and, where a gain takes long, why they are few."""
+    """Orders to try and, where a gain needs long, why they are few."""
     layout, every = design.problem.layout, sorted(set(control_of(design.model).N))
     dense = design.gain_check.loop.complete and layout.n_e > WHOLE_SPECTRUM
     if (layout.states <= MANY_STATES and not dense) or len(every) <= FEW_ORDERS:
@@ -56,7 +56,7 @@ def orders(design: Design) -> tuple[list[int], str]:
     pick = np.linspace(0, len(every) - 1, FEW_ORDERS).round().astype(int)
     few = sorted({*fast[-1:], *(every[i] for i in pick[1:])})
     why = "all eigenvalues" if dense else "products with the full plant"
-    return few, f"{layout.states} states: every gain takes {why}, so only N = {few} are tried"
+    return few, f"{layout.states} states: every gain needs {why}, so only N = {few} are tried"
 
 
 def reduce_gains(
@@ -114,7 +114,7 @@ def _ranked(design: Design, bases: Sequence[BasisGains]) -> list[BasisGains]:
 
 
 def certified(design: Design, bases: Sequence[BasisGains], sizes: range | None = None) -> list[BasisGains]:
-    """With the full plant asked for the spectrum of the best gain of every basis, or the next best. Collective.
+    """The reduced gains, the best of every basis (or the next best) checked by the full plant's spectrum. Collective.
 
     ``sizes``: orders of the gains that are offered; None for any.
     """
@@ -146,12 +146,12 @@ def with_bounds[Figures: GainQuality](
 ) -> list[Figures]:
     """The same with cost and bounds of the loop as it runs, where nothing rules the gain out. Collective.
 
-    See :mod:`softgrasp.lqr.loop.gap`. ``cost_excess_proved`` holds for the run and the optimal feedback after it. What
-    the loop's own way costs after that is an allowance in ``cost_excess_at_most``; while it is more than a tenth of the
+    See :mod:`softgrasp.lqr.loop.gap`. ``cost_excess_proved`` is that of the run and the optimal feedback after it. What
+    the loop's own way adds after that is an allowance in ``cost_excess_at_most``; while it is more than a tenth of the
     excess of a gain that is offered, the run is made twice as long, :data:`LONGER` times at most.
 
     Args:
-        solution: says what is to come after the end of the run; its error does not matter to the bound.
+        solution: gives the cost after the end of the run; its error does not matter to the bound.
     """
     gains = list(gains)
     laws: dict[int, Gain] = {i: g.gain for i, g in enumerate(gains) if g.promising and g.gain is not None}

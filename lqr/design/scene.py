@@ -1,4 +1,4 @@
-"""What a scene asks of its control: outputs and weights, target, actuation."""
+"""The control problem of a scene: outputs and weights, target, actuation."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def problem(model: Model) -> RiccatiProblem:
 
 
 def scene_target(model: Model) -> Array:
-    """Where the closed loop takes the hand: motion.target, or the end of the table.
+    """Target of the closed loop: motion.target, or the end of the table.
 
     Raises SceneError: the scene names no target, or it is the start.
     """
@@ -108,7 +108,7 @@ def sampling(model: Model) -> Sampling:
 def with_control(model: Model) -> tuple[Model, str]:
     """A scene without a [control] table gets tip output and Q = R = 1, and a turning hand is seen too. Collective.
 
-    Returns the model, and the sentence that says so; empty when the scene has its own table.
+    Returns the model, and a sentence about it; empty when the scene has its own table.
     """
     if model.scene.control is not None:
         return model, ""

@@ -58,17 +58,17 @@ class Actuation:
             fitting = 1.0 / (self.rate * max(1, int(np.ceil(ratio - 1e-6))))
             raise ControlError(
                 f"rate = {self.rate:g} Hz means ticks of {1 / self.rate:g} s, which is no multiple of the time step "
-                f"{dt:g} s; take more steps, for example of {fitting:g} s"
+                f"{dt:g} s; use more steps, for example of {fitting:g} s"
             )
         return count
 
 
 class ImplicitInput:
-    """Solve u = clip(u_0 + H u) for the input that holds within a step.
+    """Solve u = clip(u_0 + H u) for the input that is constant within a step.
 
     H is what one step turns a unit of input into, seen through the gain at the midpoint (SMW form of the implicit
     feedback). An input at its limit is fixed there, the others stay implicit: a linear complementarity problem between
-    bounds for a few unknowns, whose solution is unique where I - H is a P-matrix (feedback that takes energy out).
+    bounds for a few unknowns, whose solution is unique where I - H is a P-matrix (feedback that dissipates energy).
     Block pivoting [JP94]: all wrong inputs change sides together, after a few rounds only the last one, which ends.
     """
 
@@ -81,7 +81,7 @@ class ImplicitInput:
         condition = np.linalg.cond(self.one - H)
         if not condition < 1e12:  # beyond, the input of a step would carry fewer than four digits
             raise ControlError(
-                f"the implicit feedback of one step is singular (condition {condition:.1e}); take a smaller time step"
+                f"the implicit feedback of one step is singular (condition {condition:.1e}); use a smaller time step"
             )
         self.inverse = np.linalg.inv(self.one - H)
 
@@ -104,7 +104,7 @@ class ImplicitInput:
             side[change] = goal[change]
             u = self._fixed(u_0, side)
         raise SolverError(
-            f"the saturated inputs did not settle in {self.max_iterations} rounds; take a smaller time step"
+            f"the saturated inputs did not settle in {self.max_iterations} rounds; use a smaller time step"
         )
 
     def _fixed(self, u_0: Array, side: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What a run costs, and what the Riccati equation says it costs."""
+"""Quadratic cost of a run, and that predicted by the Riccati equation."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 def accumulated_cost(outputs: Array, inputs: Array, Q: Array, R: Array, dt: float) -> Array:
     """J(t_n) = sum_k dt (y_mid' Q y_mid + u_k' R u_k), the midpoint quadrature of the run's own step.
 
-    With u = K x_mid and X from the Riccati equation every step satisfies, exactly and for every dt,
+        With u = K x_mid and X from the Riccati equation every step satisfies, exactly and for every dt,
 
-        V(x_{n+1}) - V(x_n) = -(J(t_{n+1}) - J(t_n)),    V(x) = x'E'XE x,
+            V(x_{n+1}) - V(x_n) = -(J(t_{n+1}) - J(t_n)),    V(x) = x'E'XE x,
 
-    because the midpoint rule keeps quadratic balances [HLW06]; so J(T) + V(x(T)) = V(x(0)) up to the residual of X.
-    Input that is sampled and held costs more: by the integral of |u - K x|^2 weighted with R, second order in the
-    length of the tick.
+        because the midpoint rule keeps quadratic balances [HLW06]; so J(T) + V(x(T)) = V(x(0)) up to the residual of X.
+        An input that is sampled and held costs more, by the integral of |u - K x|^2 weighted with R, second order in
+        the length of the tick.
 
     Args:
-        outputs: y - y_bar at the grid points [m], (steps + 1, p).
-        inputs: u - u_bar of each step [N, N m], (steps, n_s).
-        R: (n_s, n_s).
-        dt: step [s].
+            outputs: y - y_bar at the grid points [m], (steps + 1, p).
+            inputs: u - u_bar of each step [N, N m], (steps, n_s).
+            R: (n_s, n_s).
+            dt: step [s].
 
-    Returns J at the grid points, (steps + 1,), J[0] = 0.
+        Returns J at the grid points, (steps + 1,), J[0] = 0.
     """
     y = (outputs[1:] + outputs[:-1]) / 2
     rate = np.einsum("ki,ij,kj->k", y, Q, y, optimize=True) + np.einsum("ki,ij,kj->k", inputs, R, inputs, optimize=True)

@@ -99,7 +99,7 @@ class ImplicitDrive(GainDrive):
 
 
 class HeldDrive(GainDrive):
-    """u = clip(u_bar + K (x - x_bar)) sampled at the start of a tick and held, if asked for some ticks later.
+    """u = clip(u_bar + K (x - x_bar)) sampled at the start of a tick and held, with a delay some ticks later.
 
     ``target``: x_bar and u_bar; u_bar acts until the first command arrives.
     """

@@ -74,7 +74,7 @@ class LoopTrajectory(Shown, FullOrderRun):
     final: PlantState
     """State at the end."""
     snapshots: Snapshots | None
-    """Stored states; None where none were asked for."""
+    """Stored states; None where none were requested."""
     saturated: float
     """Share of the steps with an input at its limit."""
     residuals: tuple[float, float]

@@ -1,10 +1,10 @@
 """How much more than the least cost a feedback can cost, proved by the duality gap of its own run.
 
-A run of N steps of the midpoint rule costs, whatever its inputs u_n,
+A run of N steps of the midpoint rule has, whatever its inputs u_n, the cost
 
     J(u) = sum_n dt (y_n'Q y_n + u_n'R u_n) + |Z'E x_N|^2,    y_n = C x_mid,
 
-the last term being what the Riccati solution X = ZZ' says is to come after t = N dt. J is a convex quadratic function
+the last term being the optimal cost after t = N dt by the Riccati solution X = ZZ'. J is a convex quadratic function
 of all inputs, J(u + d) >= J(u) + 2 dt sum_n d_n'r_n + dt sum_n d_n'R d_n, so that for the input u* of least cost
 
     J(u) - J(u*) <= dt sum_n r_n'R^{-1} r_n,    r_n = R u_n + B'p_n,
@@ -78,7 +78,7 @@ class DualityGap:
 
     @property
     def cost_excess_at_most(self) -> float:
-        """The same for a loop that goes on with its own law: with an allowance for what that costs after the end."""
+        """The same for a loop that goes on with its own law: with an allowance for its cost after the end."""
         return self._excess(self.after)
 
     @property
@@ -101,13 +101,13 @@ def duality_gaps(
 ) -> tuple[DualityGap, ...]:
     """Duality gaps of the loops under some gains, as they run from one start. Collective.
 
-    One factor and n_s runs of the full plant serve all gains; each gain then takes O(steps^2) operations with what the
+    One factor and n_s runs of the full plant serve all gains; each gain then needs O(steps^2) operations with what the
     plant answers to an input of one step.
 
     Args:
         problem: plant, outputs and weights; it has a hand.
         gains: u = u_bar + K_hat (x - x_bar) as the course samples, holds, delays and limits it.
-        solution: Z, and the optimal law, whose own run gives the best lower bound of the least cost; None takes the
+        solution: Z, and the optimal law, whose own run gives the best lower bound of the least cost; None: with the
             cost up to the end alone.
         notify: called with the number of steps done and in all.
 

@@ -74,7 +74,7 @@ def _total(plant: Plant, X: Array, b: Complex) -> Complex:
 
 
 def _solve_small(A: Complex, B: Complex) -> Complex:
-    """A^{-1} B by LAPACK itself, because the checks around it take longer than matrices of this order."""
+    """A^{-1} B by LAPACK itself, because the checks around it need longer than matrices of this order."""
     if A.size == 0:
         return np.zeros(B.shape, dtype=complex)
     _, _, X, info = scipy.linalg.lapack.zgesv(A, B)

@@ -156,8 +156,8 @@ class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
     """Galerkin on z = V eta, v_z = V eta' with V of modes and responses to the outputs.
 
     V starts with the lowest modes and K_ee^{-1} C_z and grows by S(p)^{-1} C_z at |p| between the last mode and the
-    highest one, until the gain changes by less than the tolerance between two spaces, or the space holds all of the
-    tissue. The shifts are real where damping keeps the poles of the modes left out away from the imaginary axis, so
+    highest one, until the gain changes by less than the tolerance between two spaces, or the space is all of the
+    tissue's. The shifts are real where damping keeps the poles of the modes left out away from the imaginary axis, so
     that S(p) is definite; elsewhere each takes a complex solve. The small problem keeps the second-order form and the
     energy, so it is stable whenever the tissue is damped. The true residual of such a solution is some 1e-3 in 2D
     although the gain is right to 1e-8, its tissue's part to 1e-5; residual and changes of both parts are reported, not

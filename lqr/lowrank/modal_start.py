@@ -63,8 +63,8 @@ def plant_modes(plant: Plant, k: int) -> tuple[Array, Array]:
     key = (system.K_ee.handle, system.K_ee.stateGet(), system.M_ee.handle, system.M_ee.stateGet(), plant.M_s.tobytes())
     kept = system.kept.get("floating modes")
     if kept is None or kept[0] != key or len(kept[1]) < k:
-        most = max(k, min(MORE_MODES, system.layout.n_e))  # the certificate asks for them after the start of a solver
-        kept = key, *_floating(plant, most), system.K_ee, system.M_ee  # no other matrix can take their handles
+        most = max(k, min(MORE_MODES, system.layout.n_e))  # the certificate requests them after the start of a solver
+        kept = key, *_floating(plant, most), system.K_ee, system.M_ee  # no other matrix can get their handles
         if most * system.layout.n_e <= KEPT_ENTRIES:
             system.kept["floating modes"] = kept
     return kept[1][:k].copy(), kept[2][:, :k].copy(order="F")
@@ -115,7 +115,7 @@ def solve_small(plant: Plant, space: WeightedSystem, guess: Array | None = None)
 def _few_modes(m: WeightedSystem, r: int) -> Array | None:
     """X of the lowest of r modes alone, zero for the others; None where all are few.
 
-    With the two Newton steps that follow it takes a third of the time of one Schur form for all modes.
+    With the two Newton steps that follow it needs a third of the time of one Schur form for all modes.
     """
     N, k = m.N, FEW_MODES
     if r < 2 * k:
@@ -195,7 +195,7 @@ def check_damped(plant: Plant) -> None:
 def modal_start(plant: Plant, modes: int | None = None) -> ModalStart:
     """Riccati equation of the hand and the lowest ``modes`` modes. Collective.
 
-    ``modes``: number of modes, 0 for the hand alone; None takes :data:`MODES`, or more when damping is light.
+    ``modes``: number of modes, 0 for the hand alone; None: :data:`MODES`, or more when damping is light.
 
     Raises ControlError: there is no damping at all, or the small problem has no stabilising solution.
     """

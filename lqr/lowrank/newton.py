@@ -1,6 +1,6 @@
 """Newton-Kleinman iteration with low-rank ADI, modal start, exact line search and restart files.
 
-A restart is one file a rank, and a manifest written last that knows the SHA-256 of each.
+A restart is one file a rank, and a manifest written last with the SHA-256 of each.
 """
 
 from __future__ import annotations

@@ -17,15 +17,17 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.errors import ResourceError, SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, Complex, PETSc, petsc_options, whole_copy
+from softgrasp.fem.petsc import Array, Complex, PETSc, from_options, petsc_options, whole_copy
 from softgrasp.fem.resources import free_memory
+from softgrasp.fem.solve.cholesky import direct_solves
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.plant.checks import MODAL_KEY
 
 PREFIX = "softgrasp_shifted_"
+WORKSPACE: dict[str, object] = {"mat_mumps_icntl_14": 40}  # percent beyond the estimate: pivots of an indefinite matrix
 # Every rank factors whole matrices up to here, each rank another shift: no messages in the factorisation, and SuperLU
 # in complex numbers is about as fast as MUMPS on the real form of twice the order in 2D, faster in 3D
-# (docs/benchmarks.md). Beyond, a whole factor on each rank costs too much memory.
+# (docs/benchmarks.md). Beyond, a whole factor on each rank needs too much memory.
 GATHER_LIMIT = {1: 150_000, 2: 150_000, 3: 40_000}  # 1: systems without a mesh
 # n_e up to which SuperLU works column by column in 2D, where it is the faster way; in 3D it needs its panels
 THIN_UP_TO = 20_000
@@ -53,7 +55,7 @@ class FactorsAhead:
     def take(self, shifts: Sequence[complex]) -> scipy.sparse.linalg.SuperLU:
         """The factor of the first shift; the others are begun as far as threads are idle.
 
-        The caller hands what it holds of an older factor to :meth:`free` before.
+        The caller hands its older factor to :meth:`free` before.
         """
         known = len(self.threads) - (shifts[0] not in self.coming)  # one thread has to be left for the first
         for p in [p for p in self.coming if p not in shifts[: 1 + known]]:
@@ -63,13 +65,13 @@ class FactorsAhead:
         try:
             factor = future.result()
         finally:
-            del future  # in a traceback it would keep everything alive that the caller holds
+            del future  # in a traceback it would keep everything alive that the caller references
         self._begin(shifts[1:])
         return factor
 
     def _drop(self, p: complex) -> None:
         self.maker = self.coming[p][0]
-        self.free([self.coming.pop(p)])  # no name may hold it when the thread lets it go
+        self.free([self.coming.pop(p)])  # no name may refer to it when the thread lets it go
 
     def _begin(self, shifts: Sequence[complex]) -> None:
         for p in shifts[: 1 + len(self.threads)]:
@@ -79,7 +81,7 @@ class FactorsAhead:
                 self.coming[p] = (i, self.threads[i].submit(self.make, p, i))
 
     def free(self, box: list[object]) -> None:
-        """Empty a list with the only reference to the factor taken last, in the thread that made it."""
+        """Empty a list with the only reference to the last factor, in the thread that made it."""
         self.threads[self.maker].submit(box.clear)
 
     def close(self) -> None:
@@ -138,7 +140,7 @@ class ShiftedTissue(ABC):
 
 
 class GatheredTissue(ShiftedTissue):
-    """Every rank holds all rows; the factors of ``comm.size`` shifts are made at the same time, one a rank.
+    """Every rank stores all rows; the factors of ``comm.size`` shifts are made at the same time, one a rank.
 
     SuperLU in complex numbers with diagonal pivots and one fill-reducing order (nested dissection) for all shifts. A
     program of one rank that may use another core makes the next factors there while it works with the present one.
@@ -255,7 +257,7 @@ def _cores() -> int:
 
 
 def _lu_solve(lu: scipy.sparse.linalg.SuperLU, F: Array | Complex, order: NDArray[np.int64], real: bool) -> Complex:
-    """Solve with a factor of the permuted matrix; real factors take real and imaginary part one after the other."""
+    """Solve with a factor of the permuted matrix; real factors solve real and imaginary part in turn."""
     right = F[order]
     result = np.empty(F.shape, dtype=complex)
     if not real:
@@ -292,9 +294,7 @@ class DistributedTissue(ShiftedTissue):
         pc = self.ksp.getPC()
         pc.setType("cholesky")  # LDL' for an indefinite matrix
         pc.setFactorSolverType("mumps")
-        # compressed ordering of 2 x 2 pivots: two to three times faster on these matrices than the default
-        with petsc_options(PREFIX, {"mat_mumps_icntl_12": 1, "mat_mumps_icntl_14": 40}):
-            self.ksp.setFromOptions()
+        from_options(self.ksp)
 
     def _values(self, A: PETSc.Mat) -> Array:
         indptr, columns, values = A.getValuesCSR()
@@ -317,9 +317,10 @@ class DistributedTissue(ShiftedTissue):
         S = self._real_form(p)
         self.S.setValuesCSR(S.indptr, S.indices, S.data)
         self.S.assemble()
-        self.ksp.setOperators(self.S)  # without it setUp takes the old factor for good
+        self.ksp.setOperators(self.S)  # without it setUp considers the old factor valid
         try:
-            self.ksp.setUp()
+            with petsc_options(PREFIX, WORKSPACE):
+                self.ksp.setUp()
         except PETSc.Error as error:
             raise SolverError(f"MUMPS failed at the shift p = {p:.4g} (PETSc error {error.ierr})") from error
         if self.ksp.getPC().getFailedReason():
@@ -335,7 +336,7 @@ class DistributedTissue(ShiftedTissue):
         answer = np.zeros((2 * n, k), order="F")
         B, X = (PETSc.Mat().createDense(sizes, array=array, comm=self.S.comm) for array in (right, answer))
         try:
-            self.ksp.getPC().getFactorMatrix().matSolve(B, X)
+            direct_solves(self.ksp).matSolve(B, X)
         except PETSc.Error as error:
             raise SolverError(f"MUMPS failed to solve at the shift p = {p:.4g} (PETSc error {error.ierr})") from error
         finally:
@@ -368,7 +369,7 @@ def make_shifted(system: BlockSystem, name: str = "auto") -> ShiftedTissue:
 
 
 def shifted_factor_bytes(n: int, dimension: int) -> float:
-    """What MUMPS asks for to factor S(p) of order n, all ranks together: 240 n log2 n in 2D, 800 n^(4/3) in 3D.
+    """Memory of MUMPS to factor S(p) of order n, all ranks together: 240 n log2 n in 2D, 800 n^(4/3) in 3D.
 
     Fitted to n = 6 558 to 103 038 in 2D and n = 7 227 to 52 857 in 3D.
     """
@@ -382,5 +383,5 @@ def check_shifted_memory(layout: BlockLayout) -> None:
     if needed > free:
         raise ResourceError(
             f"the factor of the shifted tissue matrix (n_e = {layout.n_e} in {layout.dimension}D) needs about "
-            f"{needed:.1f} GiB and {free:.1f} GiB are free; take fewer cells, or set {MODAL_KEY}"
+            f"{needed:.1f} GiB and {free:.1f} GiB are free; use fewer cells, or set {MODAL_KEY}"
         )

@@ -126,12 +126,12 @@ def choose_shifts(candidates: np.ndarray, weights: Array, count: int, planned: S
     """Greedy choice: the candidate where most of the residual is left, after the shifts chosen before it.
 
     Like the min-max choice of [P00], with the components of the residual in place of 1: a pole whose residual is
-    already annihilated is not taken again, one that the outputs hardly see is taken late.
+    already annihilated is not used again, one that the outputs hardly see is used late.
 
     Args:
         candidates: admissible values, Re < 0, Im >= 0.
         weights: size of the residual at each.
-        count: number of shifts; a complex one stands for its pair.
+        count: number of shifts; a complex one counts for its pair.
         planned: shifts that will be used before them.
     """
     size = np.log(np.maximum(weights, 1e-300))

@@ -82,7 +82,7 @@ class LowRankSolver[Start](ABC):
         if self.by_residual and not value <= SLACK * self.tol:
             raise SolverError(
                 f"{self.method}: the residual recomputed from Z is {value:.1e}, tolerance "
-                f"{self.tol:.0e}; rounding limits this problem: ask for a larger tolerance or add damping"
+                f"{self.tol:.0e}; rounding limits this problem: request a larger tolerance or add damping"
             )
         gain = Gain(K, np.asfortranarray(tall[:n]), np.asfortranarray(tall[n:]))
         return RiccatiSolution(

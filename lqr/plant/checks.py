@@ -1,4 +1,4 @@
-"""What the user may ask of a control problem: weights and data, one sentence for each mistake."""
+"""Checks of the user's control problem: weights and data, one sentence for each mistake."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ APART = 1e30  # of Q and R, either way: the gain goes with the root of their rat
 
 
 class ControlError(SoftgraspError):
-    """The control problem has no optimal feedback, or none that double precision can hold."""
+    """The control problem has no optimal feedback, or none that double precision can represent."""
 
 
 def check_weights(Q: Array, R: Array, outputs: int, inputs: int) -> None:

@@ -34,9 +34,12 @@ class PlantState(Shown):
 class Gain(Shown):
     """u = K x = K_s [q_s; v_s] + K_z' z + K_v' v_z."""
 
-    K_s: Array  # gain on the hand, on every rank [N/m, N s/m; N m for torques], (n_s, 2 n_s)
-    K_z: Array  # gain on z, transposed [N/m], local rows (n_local, n_s)
-    K_v: Array  # gain on v_z, transposed [N s/m], local rows (n_local, n_s)
+    K_s: Array
+    """Gain on the hand, on every rank [N/m, N s/m; N m for torques], (n_s, 2 n_s)."""
+    K_z: Array
+    """Gain on z, transposed [N/m], local rows (n_local, n_s)."""
+    K_v: Array
+    """Gain on v_z, transposed [N s/m], local rows (n_local, n_s)."""
 
     @property
     def block(self) -> Block:

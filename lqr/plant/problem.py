@@ -32,14 +32,20 @@ class RiccatiProblem(Shown):
     :func:`softgrasp.lqr.plant.second_order.second_order`.
     """
 
-    system: BlockSystem  # sparse operators of hand and tissue
-    C_s: Array  # outputs of the hand's displacement, on every rank, (p, n_s)
-    C_z: Array  # outputs of the relative displacement, transposed, local rows (n_local, p)
-    Q: Array  # weight of the outputs, symmetric positive semidefinite [1/(m2 s)], (p, p)
-    R: Array  # weight of the inputs, symmetric positive definite [1/(N2 s)], (m, m), m = n_s
-    columns: Columns = ()  # label and unit of each output, p or none
-    # forces of the inputs on the tissue, local rows (n_local, m), when there is no hand; else None
+    system: BlockSystem
+    """Sparse operators of hand and tissue."""
+    C_s: Array
+    """Outputs of the hand's displacement, on every rank, (p, n_s)."""
+    C_z: Array
+    """Outputs of the relative displacement, transposed, local rows (n_local, p)."""
+    Q: Array
+    """Weight of the outputs, symmetric positive semidefinite [1/(m2 s)], (p, p)."""
+    R: Array
+    """Weight of the inputs, symmetric positive definite [1/(N2 s)], (m, m), m = n_s."""
+    columns: Columns = ()
+    """Label and unit of each output, (p,), or none."""
     B_z: Array | None = None
+    """Forces of the inputs on the tissue, local rows (n_local, m), when there is no hand; else None."""
 
     def card(self) -> Card:
         """Size, inputs, outputs and weights."""
@@ -132,7 +138,7 @@ def translation_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> fl
 def velocity_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> float | None:
     """||(K x_T)'R(K v_T) - x_T'E'XE x_T|| / ||x_T'E'XE x_T||.
 
-    None when the damping drags against space: the identity does not hold then.
+    None when the damping drags against space: the identity is not valid then.
     """
     if problem.system.damping.in_space and problem.system.damping.alpha > 0:
         return None

@@ -26,14 +26,14 @@ def second_order(
     Assumptions: M and K symmetric positive definite, D symmetric positive semidefinite, all distributed by the same
     rows. The copies that are kept share one sparsity pattern. NewtonADI, RADI, StructuredGalerkin, DenseRiccati,
     modal_lqr and the diagnosis apply; targets, closed loops and the certified abscissa belong to a hand. The start of
-    NewtonADI takes the lowest modes: where others matter more, RADI is the faster one. Collective.
+    NewtonADI starts from the lowest modes: where others matter more, RADI is the faster one. Collective.
 
     Args:
         matrices: mass M, damping D and stiffness K, AIJ matrices (n_e, n_e).
         B: forces of unit inputs, local rows (n_local, m).
         C: outputs of the displacement, transposed, local rows (n_local, p).
-        Q: weight of the outputs, (p, p), symmetric positive semidefinite; None stands for I.
-        R: weight of the inputs, (m, m), symmetric positive definite; None stands for I.
+        Q: weight of the outputs, (p, p), symmetric positive semidefinite; None: I.
+        R: weight of the inputs, (m, m), symmetric positive definite; None: I.
         damping: coefficients of D = alpha M + beta K, which leaves modes uncoupled; the matrix D is ignored then.
 
     Returns:

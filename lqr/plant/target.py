@@ -72,7 +72,7 @@ def hand_target(problem: RiccatiProblem, q_bar: Array) -> Target:
 def output_target(problem: RiccatiProblem, y_bar: Array) -> Target:
     """Rest with the outputs at y_bar: the hand moves there plus what gravity makes them sag. Collective.
 
-    Solves C_s q_bar = y_bar - C_z' z_bar; among several hand positions the one nearest to 0 is taken.
+    Solves C_s q_bar = y_bar - C_z' z_bar; among several hand positions it is the one nearest to 0.
 
     Raises:
         ControlError: y_bar has another number of entries, or no position of the hand brings the outputs there.

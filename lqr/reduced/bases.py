@@ -32,7 +32,7 @@ STRUCTURED_MODES = 60  # candidates; more of them hardly enter an order that run
 class RiccatiBasis:
     """P_hat = V P_N V' with A_N = W' A_rel U, both in hand-relative coordinates.
 
-    For the paper's bases W = L'^{-1} V and U = S V, so that W' A_rel U = V' A V. The structured basis takes states from
+    For the paper's bases W = L'^{-1} V and U = S V, so that W' A_rel U = V' A V. The structured basis has states from
     U and costates from W; P_hat is then W P_N W' with the same equations of reduced form.
     """
 
@@ -209,7 +209,7 @@ def energy_scaled(problem: RiccatiProblem, basis: RiccatiBasis) -> RiccatiBasis:
     """The same span with columns orthonormal in the energy of hand and tissue, U'HU = I. Collective.
 
     V P_N V' depends on the span alone; in this form the reduced equation needs no balancing. The hand's displacement
-    has no energy of its own and takes the stiffness (C_s'QC_s)^{1/2} of the feedback.
+    has no energy of its own and gets the stiffness (C_s'QC_s)^{1/2} of the feedback.
     """
     system, (q_s, v_s, z, v) = problem.system, basis.U.parts
     spring = np.sqrt(np.linalg.norm(problem.C_s.T @ problem.Q @ problem.C_s, 2)) or 1.0

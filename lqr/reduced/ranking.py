@@ -34,7 +34,7 @@ def modal_excess(
         gains: K_hat, transposed, hand-relative.
         best: the optimal gain.
         start: x(0) minus target, one column.
-        law: instants of the loop; None takes the continuous law.
+        law: instants of the loop; None: the continuous law.
         settle: time after which the hand is at its target [s].
 
     Returns (gains,); infinite where the loop diverges.

@@ -10,7 +10,7 @@ import numpy as np
 from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.fem.petsc import Array, PETSc, from_options, total
 from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
 from softgrasp.fem.solve.stiffness import shared_factor
 from softgrasp.fem.system import dynamic_stiffness
@@ -26,11 +26,11 @@ from softgrasp.lqr.spectrum.tail import TailBound, why_no_bound
 PREFIX = "softgrasp_spectrum_"
 TOLERANCE = 1e-9  # of 1/(sigma - lambda)
 ERROR = 1e-6  # relative residual of an eigenpair that is let pass
-GROWTH = (24, 48, 96)  # eigenvalues asked for until they cover what the bound leaves open, after a first guess
+GROWTH = (24, 48, 96)  # eigenvalues computed until they cover what the bound leaves open, after a first guess
 ITERATIONS = 60  # restarts; eigenvalues that accumulate need any number, those before them few
 SAFE = 0.9  # of the small gain, for the radius that is aimed at
-ENOUGH = 0.7  # share of the radius aimed at, where the bound holds already
-SHOWN = 10  # modes that the circle should hold, so that the abscissa is that of the slowest of them
+ENOUGH = 0.7  # share of the radius aimed at, where the bound is valid already
+SHOWN = 10  # modes that the circle should contain, so that the abscissa is that of the slowest of them
 GAP = 1e-3  # relative distance of two eigenvalues that the circle may pass between
 NEARLY = 1e-3  # share of the abscissa by which an eigenvalue outside may exceed it
 
@@ -67,7 +67,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | N
 
     Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it:
     :class:`softgrasp.lqr.spectrum.tail.TailBound` excludes eigenvalues with Re s >= 0 beyond a radius r; the circle
-    |s - sigma| <= d with d^2 = r^2 + sigma^2 holds all others with Re s >= 0. Kelvin-Voigt damping makes infinitely
+    |s - sigma| <= d with d^2 = r^2 + sigma^2 contains all others with Re s >= 0. Kelvin-Voigt damping makes infinitely
     many eigenvalues accumulate at -1/beta as the mesh gets finer; sigma is chosen so that the circle leaves them
     outside. One solve with sigma^2 M_ee + sigma D_ee + K_ee a step, factored once; the few inputs enter by
     Sherman-Morrison-Woodbury.
@@ -92,7 +92,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | N
     n_s, K = problem.layout.n_s, gain.block
     if n_s == 0:
         raise ControlError(
-            "the certified abscissa belongs to a hand; without one take softgrasp.lqr.spectrum.modal_loop.ModalLoop"
+            "the certified abscissa belongs to a hand; without one use softgrasp.lqr.spectrum.modal_loop.ModalLoop"
         )
     K_q = K.hand[:n_s].T
     if not np.linalg.svd(K_q, compute_uv=False)[-1] > 100 * EPS * np.linalg.norm(K.hand):
@@ -153,7 +153,7 @@ def _circle(problem: RiccatiProblem, tail: TailBound | None) -> tuple[float, flo
 
 
 def _conclude(values: np.ndarray, shift: float, tail: TailBound | None, why: str) -> Abscissa:
-    """What the eigenvalues nearest to the shift say."""
+    """Result of the eigenvalues nearest to the shift."""
     distance = np.abs(values - shift)
     order = np.argsort(distance)
     values, distance = values[order], distance[order]
@@ -251,6 +251,7 @@ class Resolvent:
         eps.setWhichEigenpairs(SLEPc.EPS.Which.LARGEST_MAGNITUDE)
         eps.setDimensions(nev=count, ncv=min(2 * count + 16, self.layout.states))
         eps.setTolerances(TOLERANCE, ITERATIONS)
+        from_options(eps)
         start = self.shell.createVecRight()
         nodes = self.layout.nodes.ravel()
         start.array_w[: self.extra] = 1.0

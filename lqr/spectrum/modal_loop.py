@@ -1,4 +1,4 @@
-"""Spectrum and cost of the full plant under any gain, in energy-scaled modal coordinates."""
+"""Spectrum and quadratic cost of the full plant under any gain, in energy-scaled modal coordinates."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from softgrasp.lqr.dense.modal import ModalPlant, TissueMatrices, dense_modes, g
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
-DENSE_LIMIT = 1300  # up to here all modes can be kept when asked for: order 2600, for those who wait
+DENSE_LIMIT = 1300  # largest number of modes that can all be kept; the dense order is twice that
 FEW = 150  # modes up to which a plant keeps them all: its spectrum is exact, a tenth of a second a gain
 LOWEST_MODES = 60  # of a larger one: a hundredth
 

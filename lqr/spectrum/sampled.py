@@ -104,7 +104,7 @@ class SampledLoop:
 
     |(I - L)^{-1}| is evaluated on a grid that resolves every eigenvalue by its distance from the circle; |D| is
     bounded mode by mode in the energy norm and summed by Cauchy-Schwarz as in
-    :class:`softgrasp.lqr.spectrum.tail.TailBound`. Where this fails, all modes are taken, up to
+    :class:`softgrasp.lqr.spectrum.tail.TailBound`. Where this fails, all modes are used, up to
     :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`. Rounding, the mesh of the grids and the residual of the modes
     are not bounded.
 
@@ -195,7 +195,7 @@ class SampledLoop:
         if whole or self.coupled or self.n_e <= self.kept:
             loop, reason = self.modes(), ""
             if not loop.complete:
-                reason = f"damping couples the modes, and {self.n_e} are too many to take all"
+                reason = f"damping couples the modes, and {self.n_e} are too many to use all"
             return _Parts(loop.A, loop.B, loop.gain(K), loop.complete, reason=reason)
         if self.lowest is None:
             self.lowest = tail_modes(self.problem, self.kept)

@@ -43,12 +43,12 @@ class TailBound:
         |h| <= |K_q M_s^{-1}| / r^2 + |K_v M_s^{-1}| / r + sum_k (|K_zk| / r + |K_vk|) |g_k M_s^{-1}| b_k,
         b_k = min((1 + a / (r - a)) / (2 delta_k - 2 a), r / (r - omega_k)^2) >= |s| / |s^2 + 2 delta_k s + omega_k^2|,
 
-    2 delta_k = alpha + beta omega_k^2; the second only for r > omega_k and underdamped modes. The first holds at once
+    2 delta_k = alpha + beta omega_k^2; the second only for r > omega_k and underdamped modes. The first is true at once
     for a = 0, |s + 2 delta + omega^2 / s| >= 2 delta; for a > 0 on the line Re s = -a and on the circle |s| = r, hence
     everywhere between them and infinity, where s / (s^2 + 2 delta s + omega^2) is analytic: r > a leaves out the slow
     pole of an overdamped mode right of the line. The sum runs over the lowest modes; Cauchy-Schwarz with
-    2 delta_k - 2 a >= (beta - 2 a / omega^2) omega_k^2, omega the last of them, bounds the rest. Two-way the same holds
-    in the modes of the tissue with the hand floating, where q_s = M_s^{-1}(u / s^2 - G'z) adds to the gain on z.
+    2 delta_k - 2 a >= (beta - 2 a / omega^2) omega_k^2, omega the last of them, bounds the rest. The same is true,
+    two-way, of the modes of the tissue with the hand floating; q_s = M_s^{-1}(u / s^2 - G'z) adds to the gain on z.
 
     Where damping couples the modes (layers; two-way with alpha > 0), D >= W = alpha M + beta_min K still gives
     Re x*(s M + D + K / s) x >= x*Wx for Re s >= 0, hence |k'S^{-1}g| <= |k|_{W^{-1}} |g|_{W^{-1}} / |s|; a = 0 only.

@@ -30,9 +30,9 @@ class ReductionError(SoftgraspError):
 class Basis:
     """V of shape (2n, N) in the row blocks [hand q; hand v or p; tissue q; tissue v or p].
 
-    ``coordinates`` says whether the second half of each pair is a velocity (the paper's Galerkin models) or a
+    ``coordinates`` states whether the second half of each pair is a velocity (the paper's Galerkin models) or a
     momentum (canonical, symplectic models): p_e = M_es v_s + M_ee v_e, or p_z = M_ee v_z in the relative frame, and
-    p_s = M_hand v_s of the hand when its rows take part. ``frame`` says whether the tissue rows are absolute or
+    p_s = M_hand v_s of the hand when its rows are included. ``frame`` states whether the tissue rows are absolute or
     relative to the rigid motion of the hand, q_e = z + T q_s. With ``structure = "symplectic"`` the whole V is
     symplectic, V' J V = J; with ``fixed_solid`` its tissue columns are, by themselves.
     """

@@ -24,7 +24,7 @@ from mpi4py import MPI
 from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError, raise_on_all_ranks
-from softgrasp.fem.petsc import Array, PETSc, on_root, total
+from softgrasp.fem.petsc import Array, PETSc, from_options, on_root, total
 from softgrasp.reduction.bases.states import BasisError
 
 EngineName = Literal["tsqr", "svd", "gram"]
@@ -52,7 +52,7 @@ def magnitude(comm: MPI.Intracomm, *blocks: Array) -> float:
     """Power of two next to the largest entry over all ranks; 1 when all are zero. Collective."""
     own = float(np.max([max(X.max(), -X.min()) for X in blocks if X.size], initial=0.0))
     if comm.allreduce(not np.isfinite(own), MPI.LOR):
-        raise BasisError("the snapshots hold NaN or infinity; a basis needs finite snapshots")
+        raise BasisError("the snapshots contain NaN or infinity; a basis needs finite snapshots")
     largest = comm.allreduce(own, MPI.MAX)
     # 2^-1000 .. 2^1000 so that the inverse is finite too
     return float(2.0 ** np.clip(np.frexp(largest)[1], -1000, 1000)) if largest > 0 else 1.0
@@ -66,7 +66,7 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
         k: number of leading triplets that are enough; ``tsqr`` makes all the same.
 
     Raises:
-        BasisError: the engine is unknown, X holds NaN or infinity, or X is zero.
+        BasisError: the engine is unknown, X contains NaN or infinity, or X is zero.
         SolverError: SLEPc fails.
     """
     if engine not in ENGINES:
@@ -135,6 +135,7 @@ def _svd(comm: MPI.Intracomm, X: Array, rows: int, k: int | None) -> tuple[Array
     if leading:
         svd.setDimensions(nsv=k)
         svd.setTolerances(SVD_TOLERANCE, 1000)
+    from_options(svd)
     u, v = A.createVecLeft(), A.createVecRight()
     try:
         svd.solve()
@@ -142,7 +143,7 @@ def _svd(comm: MPI.Intracomm, X: Array, rows: int, k: int | None) -> tuple[Array
         if leading and count < k:
             raise SolverError(
                 f"SLEPc SVD: {count} of {k} singular values converged in {svd.getIterationNumber()} iterations; "
-                "ask for fewer, or use engine = 'tsqr'"
+                "request fewer, or use engine = 'tsqr'"
             )
         count = k if leading and k is not None else count
         Q, sigma = np.empty((X.shape[0], count), order="F"), np.empty(count)

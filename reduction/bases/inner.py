@@ -20,7 +20,7 @@ modes fixed, N = 18: 14 vectors beside the hand's four:
     PSD SVD-like                      4.3e-5     4.3e-5    4.3e-5
 
 The last is symplectic, not orthonormal: its pairs hardly depend on the product. Hence canonical bases beyond the
-paper's six are built in the energy product unless another is asked for.
+paper's six are built in the energy product unless another is requested.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Rows:
 
     layout: BlockLayout  # sizes and ownership
     halves: int  # 1 for displacements or momenta alone, 2 for both
-    hand: bool  # whether the hand's rows take part
+    hand: bool  # whether the hand's rows are included
 
     @property
     def top(self) -> int:
@@ -99,7 +99,7 @@ class Rows:
         return X
 
     def split(self, X: Array) -> list[tuple[Array, Array]]:
-        """Undo :meth:`stack`; the hand's rows come to every rank, zero when it takes no part. Collective."""
+        """Undo :meth:`stack`; the hand's rows come to every rank, zero when it is not included. Collective."""
         comm, n_s = self.layout.comm, self.layout.n_s
         s = [np.zeros((n_s, X.shape[1])) for _ in range(self.halves)]
         if self.hand:

@@ -58,7 +58,7 @@ def displacement_method(key: str, title: str, displacements: Displacements) -> M
 def mass_orthonormal(system: BlockSystem, X: Array, name: str = "") -> Array:
     """Phi with Phi' M_ee Phi = I and the same leading spans as X, local rows (n_local, k), Fortran order. Collective.
 
-    Raises BasisError: a column lies in the span of those before it; the message says which.
+    Raises BasisError: a column lies in the span of those before it; the message names it.
     """
     Q = np.asfortranarray(X / np.sqrt(_gram(system, X).diagonal().clip(1e-300)))
     for _ in range(2):  # twice is enough
@@ -81,7 +81,7 @@ def load_plugins(files: Sequence[Path]) -> tuple[str, ...]:
 
     A file is a Python program of the user: it may do what its user may do.
 
-    Raises BasisError: a file is missing, fails, has no METHODS, or takes the name of a shipped basis.
+    Raises BasisError: a file is missing, fails, has no METHODS, or uses the name of a shipped basis.
     """
     keys = []
     for file in files:
@@ -95,7 +95,7 @@ def load_plugins(files: Sequence[Path]) -> tuple[str, ...]:
             raise BasisError(f"{file}: it must set METHODS, a list of softgrasp.reduction.bases.plugins' methods")
         for method in found:
             if method.key in METHODS:
-                raise BasisError(f"{file}: '{method.key}' is the name of a shipped basis; take another")
+                raise BasisError(f"{file}: '{method.key}' is the name of a shipped basis; use another")
             OWN_METHODS[method.key] = method
             keys.append(method.key)
     return tuple(keys)

@@ -23,11 +23,11 @@ class PartsRequest:
 
     states: States  # system and snapshots
     snapshots: Columns  # in the coordinates and the frame of the method
-    hand: bool  # whether the hand's rows take part in the decomposition
+    hand: bool  # whether the hand's rows are part of the decomposition
     coordinates: Coordinates  # "qv" or "qp"
     inner: InnerName  # inner product
     engine: EngineName  # engine of the tall factorisation
-    count: int | None  # largest N asked for, None when only shares of energy are
+    count: int | None  # largest N requested, None when only shares of energy are
     share: float | None  # smallest share of sum sigma^2 that may be dropped, None when only N are given
 
     @property
@@ -101,7 +101,7 @@ def pod_part(
     def columns(k: int) -> tuple[Columns, ...]:
         U = f.Q @ C[:, :k]
         if by is not None and k:
-            # one more step takes the rounding of L^-1 out; it is triangular, so the nested spans stay
+            # one more step removes the rounding of L^-1; it is triangular, so the nested spans stay
             repair = cholesky_of(comm, rows.gram(U, rows.weigh(U, by)))
             U = U @ np.linalg.inv(repair.T)
         return place(U)

@@ -38,7 +38,7 @@ class Canonical:
     C_q: Array  # coordinates of q~, (r, m), on every rank
     C_y: Array  # coordinates of y~, (r, m), on every rank
     rate: float  # c
-    scale: float  # power of two taken out of the snapshots
+    scale: float  # power of two divided out of the snapshots
     momenta: bool  # whether V_p needs the factor A (canonical coordinates)
 
     def vectors(self, C: Array) -> Array:

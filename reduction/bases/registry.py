@@ -52,7 +52,7 @@ class Method:
     fixed: bool  # the hand's unit columns are kept apart from the decomposition
     pairs: bool  # units are pairs of columns, so N is even
     snapshots: bool = True  # whether it needs any
-    inner: InnerName = "euclidean"  # inner product it is built in unless another is asked for
+    inner: InnerName = "euclidean"  # inner product it is built in unless another is requested
 
     @property
     def short_title(self) -> str:
@@ -131,7 +131,7 @@ def make_basis(
         states: system and snapshots: z and v_z (2 n_local, m) [m, m/s] with the hand (n_s, m) of every run.
         size: N of the whole basis, the hand's columns included, or a rule; None keeps 99.9 % of the energy, as the
             paper does.
-        inner: inner product; None takes energy on graded meshes, else that of the method: Euclidean for the paper's six
+        inner: inner product; None: energy on graded meshes, else that of the method: Euclidean for the paper's six
             and all in (q, v), energy for canonical bases beyond them, where it is ten times better. SVD-like pairs
             depend on it little.
         engine: engine of the tall factorisation.
@@ -217,7 +217,7 @@ def impossible_sizes(method: Method, n_s: int, sizes: Sequence[int]) -> dict[int
     step = 2 if method.pairs else 1
     hand = 2 * n_s if method.fixed else 0
     least = hand + step
-    reasons = {N: f"the {hand} columns of the hand count; ask for N >= {least}" for N in sizes if least > N}
+    reasons = {N: f"the {hand} columns of the hand count; request N >= {least}" for N in sizes if least > N}
     return reasons | {N: "only even N exist for this basis" for N in sizes if N % step}
 
 

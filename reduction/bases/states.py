@@ -19,7 +19,7 @@ class BasisError(ReductionError):
     """A basis cannot be built from what is given.
 
     Attributes:
-        most: largest N there is, where more was asked for.
+        most: largest N there is, where more was requested.
     """
 
     def __init__(self, reason: str, basis: str = "", most: int | None = None) -> None:
@@ -112,7 +112,7 @@ def _check(layout: BlockLayout, system: BlockSystem, snapshots: Snapshots) -> No
         if not np.isfinite(X.sum()) and not np.isfinite(X).all():
             j = int(np.flatnonzero(~np.isfinite(X).all(axis=0))[0])
             raise BasisError(
-                f"snapshot {j} (step {int(snapshots.steps[j])}) holds NaN or infinity; "
+                f"snapshot {j} (step {int(snapshots.steps[j])}) contains NaN or infinity; "
                 "a basis needs finite snapshots: check the run that made them"
             )
 

@@ -12,12 +12,12 @@ from softgrasp.fem.petsc import Array, on_root
 from softgrasp.reduction.bases.engines import EPS
 from softgrasp.reduction.bases.states import BasisError
 
-# eigenvalues of X'JX carry an absolute error eps * |X|^2: a stage takes those that keep about ten digits
+# eigenvalues of X'JX carry an absolute error eps * |X|^2: a stage uses those that keep about ten digits
 STAGE = 1e-6
 SMALLEST = 1e-13  # what is left below this share of |X| is rounding of the snapshots
-# V'JV = J can hold to about eps |s|^2 only: vectors that are almost J-orthogonal make no pair with each other
+# V'JV = J can be true to about eps |s|^2 only: vectors that are almost J-orthogonal make no pair with each other
 LONGEST = 200.0  # |s|^2 + |t|^2
-DROP = 0.1  # directions without partner are taken together down to this share of the largest
+DROP = 0.1  # directions without partner are used together down to this share of the largest
 
 
 def apply_j(Y: Array) -> Array:
@@ -36,9 +36,9 @@ def svd_like_pairs(
 ) -> tuple[Array, Array]:
     """Symplectic S = [s_1 .. s_k, t_1 .. t_k] that spans X, ordered by the weight of the pairs. Collective.
 
-    X = S D Q with orthogonal Q; D holds sigma_i twice for every hyperbolic pair, +-i sigma_i^2 the eigenvalues of the
+    X = S D Q with orthogonal Q; D has sigma_i twice for every hyperbolic pair, +-i sigma_i^2 the eigenvalues of the
     skew matrix X'JX, and 1 for directions that have no partner in X [BBH19]. One eigenvalue problem loses every pair
-    below sqrt(eps) sigma_1, so each stage takes only the large ones, and the next works on X - S S^+ X with the
+    below sqrt(eps) sigma_1, so each stage uses only the large ones, and the next works on X - S S^+ X with the
     symplectic inverse S^+ = J' S' J; the stages together are the same decomposition. A direction u without partner
     in X gets the one that is J-orthogonal to all others, t = (I - S S^+) J' u.
 
@@ -48,7 +48,7 @@ def svd_like_pairs(
         limit: number of pairs that are enough; None for all.
         share: part of |X|_F^2 that may be left out beyond the ``limit``; None sets no goal.
 
-    Returns S (2 r, 2 k), S' J S = J, and w (k,) descending; sum w^2 = |X|_F^2 when all are taken and have partners.
+    Returns S (2 r, 2 k), S' J S = J, and w (k,) descending; sum w^2 = |X|_F^2 when all are used and have partners.
     """
     return on_root(comm, lambda: _pairs(X, limit, share))
 
@@ -151,7 +151,7 @@ class _PairSelection:
         self.S, self.T = np.hstack([self.S, S]), np.hstack([self.T, T])
         self.weights = np.concatenate([self.weights, weights])
         rest = self.rest
-        for _ in range(2):  # the second pass takes out the rounding of the first
+        for _ in range(2):  # the second pass removes the rounding of the first
             rest = self._complement(rest)
         self.rest = rest
 
@@ -169,7 +169,7 @@ def symplectic_repair(B: Array) -> Array:
         return np.linalg.inv(np.real(scipy.linalg.sqrtm(-apply_j(B))))
     except np.linalg.LinAlgError as error:
         raise BasisError(
-            "SVD-like pairs of these snapshots are linearly dependent to rounding; take a smaller N or another basis"
+            "SVD-like pairs of these snapshots are linearly dependent to rounding; use a smaller N or another basis"
         ) from error
 
 

@@ -15,7 +15,7 @@ PAPER_ENERGY = 0.999  # of the POD functional [SBRH21]
 
 @dataclass(frozen=True)
 class Part:
-    """One ordered family of units, each of one column or of a symplectic pair."""
+    """Vectors of one quantity in the order of their importance, by units: one column each, or a symplectic pair."""
 
     title: str  # what it spans, for messages
     sigma: Array  # importance of the units over ``scale``, descending (singular values)
@@ -23,13 +23,13 @@ class Part:
     rank: int  # number of units that are more than noise
     # makes the leading k units; one set of columns per half of the pair. Collective.
     columns: Callable[[int], tuple[Columns, ...]]
-    scale: float = 1.0  # power of two taken out of sigma, so that squares neither overflow nor vanish
+    scale: float = 1.0  # power of two divided out of sigma, so that squares neither overflow nor vanish
     rate: float = 1.0  # weight c between displacement and momentum, see `reduction/bases/inner.py`
 
 
 @dataclass(frozen=True)
 class Truncation:
-    """Exactly one of the three says how many vectors are taken."""
+    """Exactly one of the three determines the number of vectors."""
 
     N: int | None = None  # dimension of the whole basis, with the hand's columns
     energy: float | None = None  # share of sum sigma^2 to keep at least in every part, 0 < energy < 1
@@ -67,10 +67,10 @@ def needed(sigma: Array, total: float, share: float) -> int | None:
 
 
 def _allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) -> tuple[int, ...]:
-    """Share N - hand columns equally among the parts, the first ones taking one more where it does not divide.
+    """Share N - hand columns equally among the parts, the first ones getting one more where it does not divide.
 
     What a part cannot carry goes to the others. Displacement and velocity need equally many vectors, whatever their
-    singular values say: a displacement without its velocity cannot move.
+    singular values: a displacement without its velocity cannot move.
     """
     free = N - hand
     if free < width or free % width:
@@ -82,7 +82,7 @@ def _allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) -
         carried = " + ".join([*(str(width * r) for r in ranks), *([f"{hand} of the hand"] if hand else [])])
         most = hand + width * sum(ranks)
         raise BasisError(
-            f"N = {N} is more than the snapshots carry above rounding ({carried}); ask for N <= {most}", name, most
+            f"N = {N} is more than the snapshots carry above rounding ({carried}); request N <= {most}", name, most
         )
     counts = [0] * len(parts)
     for _ in range(want):
@@ -97,10 +97,10 @@ def counts_of(parts: Sequence[Part], width: int, hand: int, rule: Truncation, na
 
     Args:
         width: columns of one unit.
-        hand: columns that the hand takes.
+        hand: columns of the hand.
 
     Raises:
-        BasisError: N is smaller than the hand's columns, no multiple of the unit, or the rule asks for more than the
+        BasisError: N is smaller than the hand's columns, no multiple of the unit, or the rule needs more than the
             rank.
     """
     if rule.N is not None:
@@ -111,7 +111,7 @@ def counts_of(parts: Sequence[Part], width: int, hand: int, rule: Truncation, na
         if k is None or k > part.rank:
             raise BasisError(
                 f"the {part.title} cannot be kept to {rule.share:.1e} of its energy with the {part.rank} "
-                "singular values above rounding; ask for a larger tol, or for N",
+                "singular values above rounding; request a larger tol, or an N",
                 name,
             )
         counts.append(k)

@@ -6,7 +6,7 @@ forces K^-1 (r^+ - r^) / dt and r - mean r^: in the energy norm |e|^2 = e_z'K e_
     |e'_0| = |r^_0|_{K^-1},   |e'_+| <= |e'| + dt sqrt(|(r^+ - r^) / dt|_{K^-1}^2 + |r - mean r^|_{M^-1}^2),
     |e| <= |e'| + |r^|_{K^-1}.
 
-Here r^ is the mean of its neighbours, which takes the ringing of steps out of it. Damping only helps. The textbook
+Here r^ is the mean of its neighbours, which removes the ringing of steps. Damping only helps. The textbook
 bound |e| <= dt sum |r|_{M^-1} charges what the basis lacks at every step anew.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from softgrasp.fem.petsc import Array
 
 POINTS, PLACES = 400, 400  # frequencies of a kernel's maximum, and steps at which it is computed
-SAFETY = 1.01  # of the kernel: its maximum is taken on a grid
+SAFETY = 1.01  # of the kernel: its maximum is computed on a grid
 GAIN = 1.0  # decay over the run, in powers of e, from which a kernel is worth its cost
 
 
@@ -28,7 +28,7 @@ def node_average(rows: Array, first: Array | None = None, nodes: Array | None = 
 
     Args:
         rows: values at the midpoints, (w, steps).
-        first: node value at the start, (w,); None takes the first midpoint value.
+        first: node value at the start, (w,); None: the first midpoint value.
         nodes: array for the node values; None makes one.
     """
     nodes = np.empty((len(rows), rows.shape[1] + 1)) if nodes is None else nodes
@@ -57,9 +57,6 @@ def static_bound(
     dt: float,
     balanced: bool = False,
     kernel: Kernel | None = None,
-    drift: Array | None = None,
-    gap: Array | None = None,
-    start: float = 0.0,
 ) -> Array:
     """|e|_E at every step, (steps + 1,).
 
@@ -69,14 +66,10 @@ def static_bound(
         dt: step [s].
         balanced: a start in equilibrium, where e_0 = -K^-1 r^_0; else at rest, e_0 = 0.
         kernel: see :func:`decay`; None: nothing decays.
-        drift: |z_r' - v~|_K of inexact kinematics, (steps,).
-        gap: |v~ - v_r|_M of the same at the steps, (steps + 1,).
-        start: |v~_0|_M of the same.
     """
     node = lengths(nodes)
-    rate = lengths(np.diff(nodes)) / dt
-    force = np.hypot(rate if drift is None else rate + drift, rest)
-    begin = np.hypot(0.0 if balanced else node[0], start)
+    force = np.hypot(lengths(np.diff(nodes)) / dt, rest)
+    begin = 0.0 if balanced else node[0]
     steps = len(force)
     moved = np.zeros(steps + 1)
     if kernel is None:
@@ -88,7 +81,7 @@ def static_bound(
         free, forced = kernel
         moved[1:] = dt * convolve(force, forced[:steps])[:steps]
         moved += begin * free[: steps + 1]
-    return np.asarray(moved + (node if gap is None else np.hypot(node, gap)))
+    return np.asarray(moved + node)
 
 
 def decay(low: float, high: float, alpha: float, beta: float, dt: float, steps: int) -> Kernel | None:

@@ -1,4 +1,4 @@
-"""What a certified run says about its errors: bounds that are proved, and numbers that are estimates and say so."""
+"""Errors of a certified run: proved bounds, and estimates, which are called estimates."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NORMS = {"energy": "largest energy norm of the deformation", "output": "largest 
 
 
 class ToleranceError(SoftgraspError):
-    """The proved error of a run is above what was asked for.
+    """The proved error of a run is above the tolerance.
 
     Attributes:
         run: the run with its certificate.
@@ -79,11 +79,11 @@ class Certificate:
             do not.
         time_step: estimate of the error of the step, relative, in the energy norm; None where no finer table of the
             motion was given.
-        time_step_proof: :attr:`time_step` with the bounds of both runs added; None if not asked for.
+        time_step_proof: :attr:`time_step` with the bounds of both runs added; None if not requested.
         mesh: estimate of the error of the mesh; None: not known.
         inside: the materials lie in the box that the model was trained in.
         norm: what :attr:`reduction` is about: "energy" or "output".
-        tolerance: asked for; None: none.
+        tolerance: of the relative error; None: none was set.
     """
 
     energy: Bound
@@ -115,7 +115,7 @@ class Certificate:
 
     @property
     def reduction(self) -> float:
-        """Relative error of the reduction in the norm asked for."""
+        """Proved relative error of the reduction, in the norm of the tolerance."""
         return (self.outputs if self.norm == "output" else self.energy).relative
 
     def claim(self, number: str) -> str:
@@ -131,12 +131,12 @@ class Certificate:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """What a user should know, in sentences."""
+        """Warnings about this run, one sentence each."""
         result = []
         if not self.inside:
-            result.append("The materials lie outside the box of the training; the bound holds all the same.")
+            result.append("The materials lie outside the box of the training; the bound is valid there too.")
         if self.reduction > 1:
-            result.append("The bound is larger than the deformation itself, so it says nothing about this run.")
+            result.append("The bound is larger than the deformation itself, so it proves nothing about this run.")
         others = {"time step": self.time_step, "mesh": None if self.mesh is None else self.mesh.largest}
         value, key = max(((value, key) for key, value in others.items() if value is not None), default=(0.0, ""))
         if value > self.reduction:

@@ -15,7 +15,7 @@ exp(sigma t_n) times the mean of |Y| on the circle, it bounds what is left at ev
 output at n + L, n + 2 L, ... is added, exp(-sigma L dt) times as large; |e| <= dt sum |r|_{M^-1} bounds it. After the
 last step the residual is led to zero, which no earlier step feels. d is Galerkin's in W = [Phi, Psi], with Psi from
 static responses to c and the lowest modes over the box; or 0, where that is better. From an equilibrium the start
-e_0 = -K^-1 r_0 is taken out first, with the dual at s = 0.
+e_0 = -K^-1 r_0 is removed first, with the dual at s = 0.
 
 The gain is that of a residual whose frequencies the duals resolve, as with damping. Without damping the residual rings
 in all modes (on the paper's scene 99 % of it lies below the frequency of mode 713 of 956), and the bound of the energy
@@ -48,7 +48,7 @@ DUALS, MODES = 60, 30  # vectors of Psi, and modes that it is made of at every p
 LENGTH = 16  # runs that the circle spans, with sigma = 1 / run: what is added from beyond is e^-16 times as large
 FREQUENCIES = 2000  # at most, at which duals are made: where the residual matters most
 LARGEST = 20_000_000  # numbers on the circle, of which some copies of 16 byte are made
-IGNORED = 2e-3  # of what the residual has on the circle may stay without duals, which take off a factor of 100 or so
+IGNORED = 2e-3  # of what the residual has on the circle may stay without duals, which divide a bound by about 100
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def dual_vectors(model: Model, places: Sequence[Materials], space: ResidualSpace
 
 
 def output_duals(model: Model, places: Sequence[Materials], space: ResidualSpace, Phi: Array) -> OutputDuals:
-    """Duals for the basis Phi, whose columns ``space`` holds; it takes those of the duals too. Collective.
+    """Duals for the basis Phi, whose columns ``space`` has; those of the duals are added to it. Collective.
 
     Args:
         model: the scene, whose layers share one damping.

@@ -64,14 +64,14 @@ class CertifiedModel(Shown):
         k: modes of the answer; k2 when there is one basis.
         norms: residual norms of the larger basis.
         compliance: sqrt(c' K_r^-1 c) of every output component, (p,).
-        box: where it was trained; None: nowhere.
+        box: materials of the training; None: it was not trained.
         tolerance: relative error above which a run is refused; None: never.
         certify: "two" bases, the "proof" of one, or the "estimate" of two.
-        norm: in which the tolerance counts, "energy" or "output".
-        mesh: error of the mesh at some parameters.
+        norm: of the tolerance, "energy" or "output".
+        mesh: estimates of the mesh's error at some parameters.
         drive: the motion of the scene.
-        training: what the greedy did, for archive and reports.
-        duals: of the outputs, for sharper bounds on them; None: the bound of the energy norm alone.
+        training: steps, sizes and end of the training, for archive and reports.
+        duals: dual problems of the outputs, for sharper bounds; None: outputs have the bound of the energy norm alone.
     """
 
     fine: ReducedModel
@@ -88,13 +88,13 @@ class CertifiedModel(Shown):
     duals: OutputDuals | None = None
 
     def __post_init__(self) -> None:
-        fine, k2, second = self.fine, self.norms.k, self.fine.structure == "second_order"
-        if not (fine.fixed_solid and fine.frame == "relative" and (second or self.norms.shape is not None)):
-            raise ModelError("a certificate needs a basis with fixed solid modes relative to the hand", fine.name)
-        if fine.two_way and not second:
-            raise ModelError("with two-way coupling only a second-order basis has a certificate", fine.name)
-        if not 0 < self.k <= k2 or (self.k < k2 and not second):
-            raise ModelError(f"k = {self.k} of {k2} modes; only second-order bases have leading ones", fine.name)
+        fine, k2 = self.fine, self.norms.k
+        if not (fine.fixed_solid and fine.frame == "relative" and fine.structure == "second_order"):
+            raise ModelError(
+                "a certificate needs a second-order basis with fixed solid modes relative to the hand", fine.name
+            )
+        if not 0 < self.k <= k2:
+            raise ModelError(f"k = {self.k}; it must be between 1 and {k2}", fine.name)
         if self.certify != "proof" and self.k == k2:
             object.__setattr__(self, "certify", "proof")
 
@@ -168,10 +168,10 @@ class CertifiedModel(Shown):
         """A run of the small basis with its certificate. Online; not collective.
 
         Args:
-            materials: one per layer; None takes those of the projection.
-            drive: what moves the hand; None takes the scene's motion.
-            tolerance: relative; None takes that of the model.
-            gravity: acceleration of free fall (n_s,) [m/s^2]; None takes that of the scene.
+            materials: one per layer; None: those of the projection.
+            drive: what moves the hand; None: the scene's motion.
+            tolerance: relative; None: that of the model.
+            gravity: acceleration of free fall (n_s,) [m/s^2]; None: that of the scene.
             allow: return a run above the tolerance too.
             prove_time_step: prove the error of the step as well, by a second certified run at the finer step.
 
@@ -211,13 +211,14 @@ class CertifiedModel(Shown):
         return [CertifiedRun(answer.trajectory(drive.dt, names), certificate) for answer, certificate in found]
 
     def certificates(self, many: Sequence[Materials], drive: Drive | None = None) -> list[Certificate]:
-        """What :meth:`run_batch` proves, without the states."""
+        """Certificates of :meth:`run_batch`, without the states."""
         return [certificate for _, certificate in self._each(many, self._given(drive))]
 
     def _given(self, drive: Drive | None) -> Drive:
+        """The drive, or the scene's motion. Raises ModelError: there is neither."""
         drive = self.drive if drive is None else drive
         if drive is None:
-            raise ModelError("give the motion of the hand, or the force on it; the model holds none", self.fine.name)
+            raise ModelError("give the motion of the hand, or the force on it; the model has none", self.fine.name)
         return drive
 
     def _each(
@@ -243,11 +244,12 @@ class CertifiedModel(Shown):
                 yield answer, replace(certificate, tolerance=tolerance, mesh=self.mesh, norm=self.norm)
 
     def _motions(self, k: int, many: Sequence[Materials], drive: Drive, g: Array, residual: bool) -> list[Motion]:
+        """Runs of the leading k modes at every parameter, with their residuals where these are needed."""
         model = self.fine if k == self.k2 else self.coarse
         norms = self.norms if residual else None
         hand = known_hand(model, drive, g)
         alike = all(len({m.beta for m in materials}) == 1 for materials in many)
-        if model.structure == "second_order" and hand is not None and alike:
+        if hand is not None and alike:
             return modal_motions(model, self._blocks[k], norms, many, drive, g, hand)
         return [stepped_motion(model, norms, materials, drive, g) for materials in many]
 
@@ -271,6 +273,7 @@ class CertifiedModel(Shown):
         return result
 
     def _certificate(self, materials: Materials, answer: Motion, fine: Motion, drive: Drive, g: Array) -> Certificate:
+        """Bounds and estimates of the answer from the run of the larger basis."""
         size, rigid = answer.size, answer.q_s @ self.fine.outputs.C_s.T
         deformation = float(bounds.lengths((answer.outputs - rigid).T).max())
         estimate = wide = sharper = None
@@ -317,20 +320,20 @@ class CertifiedModel(Shown):
         return self._energy(self.fine, materials, d, drive)
 
     def _energy(self, model: ReducedModel, materials: Materials, d: Array, drive: Drive) -> Array:
+        """Energy norm |d|_E of states (steps + 1, N), (steps + 1,)."""
         small = model.at(materials)
         energy = small.total_energy(d) if self._coupled(drive) else small.energy(d)
         return np.asarray(np.sqrt(np.maximum(2 * energy, 0.0)))
 
     def _bound(self, motion: Motion, materials: Materials, drive: Drive) -> Array:
-        """Static bound of a run, (steps + 1,)."""
+        """Static bound of the energy norm of a run's error, (steps + 1,)."""
         r = motion.residual
         assert r is not None
         kernel, betas = None, {m.beta for m in materials}
         if not self._coupled(drive) and len(betas) == 1 and self.fine.damped:
             low, high = self.norms.frequencies(materials)
             kernel = bounds.decay(low, high, self.fine.alpha, betas.pop(), drive.dt, drive.steps)
-        drift, gap, start = r.inexact or (None, None, 0.0)
-        return bounds.static_bound(r.nodes, r.rest, drive.dt, drive.start == "equilibrium", kernel, drift, gap, start)
+        return bounds.static_bound(r.nodes, r.rest, drive.dt, drive.start == "equilibrium", kernel)
 
     def _output_bound(self, bound: Array, materials: Materials, drive: Drive) -> Array:
         """Bound of every output component from one of the energy, (steps + 1, p)."""

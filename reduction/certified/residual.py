@@ -22,7 +22,7 @@ from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.material import LayerMaterial
-from softgrasp.fem.petsc import Array, PETSc, times_columns, total
+from softgrasp.fem.petsc import Array, PETSc, from_options, times_columns, total
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from softgrasp.fem.system import BlockSystem
@@ -44,8 +44,6 @@ class ResidualNorms:
     n_s: int  # number of degrees of freedom of the hand [1]
     dimension: int  # space dimension d
     omega: tuple[float, float]  # lowest and (a bound on the) highest frequency at the reference [1/s]
-    # triangles of L_q in K_r and of [L_q, L_v] in M_r, for models with inexact kinematics; else None
-    shape: tuple[Array, Array] | None = None
 
     @property
     def k(self) -> int:
@@ -145,7 +143,7 @@ class Orthonormal:
 
     Args:
         system: system of the tissue, for the distribution of the rows and the choice of the solver.
-        W: matrix of the norm, symmetric positive definite; None stands for W^-1 = ``product``.
+        W: matrix of the norm, symmetric positive definite; None: W^-1 = ``product``.
         product: matrix W^-1 itself, which needs no solver; None where W is given.
     """
 
@@ -199,7 +197,7 @@ class Orthonormal:
         return np.asarray(self.comm.bcast(T))
 
     def destroy(self) -> None:
-        """Free what PETSc holds. Collective."""
+        """Free the PETSc objects. Collective."""
         if self.product is None:
             self.solver.destroy()
 
@@ -276,6 +274,7 @@ def highest_frequency(system: BlockSystem) -> float:
     ksp.setType("cg")
     ksp.getPC().setType("jacobi")
     ksp.setTolerances(rtol=1e-10, max_it=500)
+    from_options(eps)
     try:
         eps.solve()
         if eps.getConverged() < 1:
@@ -286,13 +285,3 @@ def highest_frequency(system: BlockSystem) -> float:
     finally:
         eps.destroy()
     return float(system.layout.comm.allreduce(value, MPI.MAX))
-
-
-def kinematic_triangles(space: ResidualSpace, L_q: Array, L_v: Array) -> tuple[Array, Array]:
-    """Triangles of L_q in K_r and of [L_q, L_v] in M_r, for :attr:`ResidualNorms.shape`. Collective."""
-    triangles = []
-    for product, columns in ((space.system.K_ee, L_q), (space.system.M_ee, np.hstack([L_q, L_v]))):
-        basis = Orthonormal(space.system, None, product)
-        basis.add(columns)
-        triangles.append(basis.triangle())
-    return triangles[0], triangles[1]

@@ -1,4 +1,4 @@
-"""Trains certified models of a scene: full runs where the greedy asks for them, modes that they add, sizes, mesh.
+"""Training of certified models of a scene: full runs where the greedy method needs them, their modes, sizes, mesh.
 
 X = [z, tau v] of a full run, less its projection on Phi in K_r, gives its leading POD modes to Phi; tau makes both
 halves equally long.
@@ -28,7 +28,7 @@ from softgrasp.reduction.certified.training import certified_model, scene_drive
 from softgrasp.reduction.certified.validation import measured_error
 from softgrasp.reduction.parameters import box_of, materials_at, outside, run_with, thinned
 
-COLUMNS = 200  # states of a full run that its modes are taken from
+COLUMNS = 200  # states of a full run that its modes are computed from
 CACHED = 3e8  # entries of full runs that are kept, in case a point comes again: 2.4 GB over all ranks
 SHARE = 0.5  # of the tolerance that the larger basis may use, so that the smaller one has the rest
 RANDOM = 100  # parameters beside the grid where the finished model is looked at
@@ -36,7 +36,7 @@ ADDED = 10  # of these become points of the training at most, each as the worst 
 PLACES = 4  # trained parameters at which the mesh is estimated
 ROUNDING = 1e-11  # of a run's length: what is left of it below is rounding
 WATCHED, WORST = 20, 4  # parameters by which the size of the smaller basis is found; of these looked at first
-WORTH = 0.7  # of an output's bound, above which duals are not worth the time that they take in every answer
+WORTH = 0.7  # of an output's bound, above which duals are not used: they lengthen every answer
 DUAL_PLACES = 3  # values of each constant at which duals are made to be good
 SEED = 20
 
@@ -87,7 +87,7 @@ class Trainer:
     """The full model of a scene, the basis grown from it, and the grid of its box. Collective.
 
     Args:
-        model: the scene; ``reduction`` says how.
+        model: of the scene; its table ``reduction`` has tolerance, box and method.
         earlier: a model with reconstruction, of the same :func:`train_key`, to go on from; None: none.
 
     Raises:
@@ -99,7 +99,7 @@ class Trainer:
         if reason := outside(model):
             raise SceneError(f"{reason}; a certified model needs its box around the scene's own material")
         if model.system.points is not None:
-            raise SceneError("effects.finite_strain makes the tissue nonlinear; the bound holds for linear tissue only")
+            raise SceneError("effects.finite_strain makes the tissue nonlinear; its bound needs linear tissue")
         self.model, self.models = model, motions_of(model)
         self.comm = model.system.layout.comm
         lam, mu = box_of(model)
@@ -173,7 +173,7 @@ class Trainer:
         return np.asfortranarray(X)
 
     def _leading(self, Z: Array, count: int) -> Array:
-        """Leading POD modes of what Phi does not hold of a run, orthonormal in K_r with Phi. Collective."""
+        """Leading POD modes of the part of a run outside the span of Phi, orthonormal in K_r with Phi. Collective."""
         n = len(Z) // 2
         K = self.space.system.K_ee
 
@@ -280,7 +280,7 @@ def build_certified(
         progress: called after every round with the model so far, which can be saved and gone on from.
 
     Returns:
-        The model; ``training["reason"]`` says how the greedy ended, ``training["proved"]`` the largest bound over the
+        The model; ``training["reason"]`` is why the training ended, ``training["proved"]`` the largest bound over the
         grid and random parameters. It has the tolerance whether or not that was reached: what is above is refused.
     """
     options, count = trainer.model.scene.reduction, len(trainer.points)

@@ -4,7 +4,7 @@ The run (a, v) is put into the finer equation, whose first columns are its own; 
 
     e'' + D e' + K(t) e = r,   r = -G (a_s - g) - v' - D a' - dW/da,   e(0) = K(0)^-1 r(0) from an equilibrium, else 0
 
-K(t) is the finer tangent along the run. Midpoint steps of e take many steps of the run at once: r is evaluated in the
+K(t) is the finer tangent along the run. Midpoint steps of e span many steps of the run: r is evaluated in the
 middle of each, K(t) in some of them, in between it is linear. The estimate is |E|_F / |A + E|_F of z.
 
 No bound: e is of first order, and what no training run moved is in none of the columns. Inside the training box it came

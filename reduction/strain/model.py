@@ -27,7 +27,7 @@ from softgrasp.reduction.system import ModelError, Outputs
 
 TOLERANCE = 1e-10  # of a step's residual: the drift of a model's own energy stays near it
 SLACK = 1e-9  # of the edges of the box: rounding of the user's own arithmetic
-# of accelerations: those of a run are means over its steps h, off the peak of a motion by up to (w h)^2 / 6, hence 1 %
+# of accelerations: those of a run are means over its steps h, up to (w h)^2 / 6 below the peak of a motion, hence 1 %
 # from 25 steps a period on; another step of the same motion comes closer to the peak than the training did
 LOAD_SLACK = 1e-2
 REACH, SMALL = 2.0, 0.02  # times what the training runs reached, of coordinates above this share of the largest
@@ -71,19 +71,25 @@ class TrainingDomain:
         i = int(np.argmax(ratio))
         if ratio[i] <= REACH:
             return ""
-        return f"the run takes coordinate {i + 1} to {ratio[i]:.2g} times what the training runs reached"
+        return f"the run moves coordinate {i + 1} to {ratio[i]:.2g} times what the training runs reached"
 
 
 @dataclass(frozen=True, repr=False)
 class StrainRun(ReducedTrajectory):
     """A reduced run at finite strain, x = [q_s, v_s, a, a']."""
 
-    small: ReducedStrainSystem = field(repr=False)  # what was stepped
-    acceleration: Array = field(repr=False)  # a_s - g [+ alpha v_s] at the midpoints, (steps, n_s) [m/s^2, rad/s^2]
-    evaluations: float  # of the force, in the mean of a step
-    restarts: int  # fresh tangents
-    engine: str  # "C" or "NumPy"
-    untrained: str = ""  # why the run lies outside of what the model was trained on; empty inside
+    small: ReducedStrainSystem = field(repr=False)
+    """System at the parameter and time step of the run."""
+    acceleration: Array = field(repr=False)
+    """Apparent acceleration a_s - g [+ alpha v_s] of the hand at the midpoints [m/s^2, rad/s^2], (steps, n_s)."""
+    evaluations: float
+    """Mean number of evaluations of the force in a step."""
+    restarts: int
+    """Number of tangents made anew in the run."""
+    engine: str
+    """Name of the stepper, "C" or "NumPy"."""
+    untrained: str = ""
+    """Reason why the run lies outside of the training domain, a sentence; empty inside."""
 
     @property
     def a(self) -> Array:
@@ -135,11 +141,16 @@ def coordinates(run: ReducedTrajectory) -> tuple[Array, Array]:
 class ReducedStrainSystem(Shown):
     """A model at one parameter and one time step, everything made that a run needs."""
 
-    model: StrainModel  # it comes from
-    problem: StrainProblem  # potential, damping, tangent at rest, step
-    materials: tuple[LayerMaterial, ...]  # one a layer
-    gravity: Array  # acceleration of free fall, (n_s,)
-    outside: bool = False  # runs outside of the training box are allowed
+    model: StrainModel
+    """Reduced model that it was made from."""
+    problem: StrainProblem
+    """Potential, damping, tangent at rest and time step."""
+    materials: tuple[LayerMaterial, ...]
+    """Materials of the run, one a layer."""
+    gravity: Array
+    """Acceleration of free fall [m/s^2], (n_s,)."""
+    outside: bool = False
+    """Whether runs outside of the training domain are allowed."""
 
     @cached_property
     def finer(self) -> StrainProblem | None:
@@ -185,7 +196,7 @@ class ReducedStrainSystem(Shown):
         model, dt = self.model, self.problem.dt
         q, v = checked_hand(hand, model.G.shape[1])
         if not (np.isfinite(q).all() and np.isfinite(v).all()):
-            raise ModelError("the hand's tables hold numbers that are not finite")
+            raise ModelError("the hand's tables contain numbers that are not finite")
         c = np.diff(v, axis=0) / dt - self.gravity
         untrained = model.box.refuse(self.materials) or model.box.refuse_load(c)
         refuse(untrained, self.outside)
@@ -222,26 +233,46 @@ def refuse(reason: str, outside: bool) -> None:
 class StrainModel(Shown):
     """Reduced model of tissue at finite strain for all lambda and mu of its training box."""
 
-    cells: Cells  # sampled cells, in reduced coordinates
-    K_mu: Array  # linear stiffness of every layer at mu = 1 Pa, lambda = 0, (layers, k, k)
-    K_lambda: Array  # linear stiffness of every layer at lambda = 1 Pa, mu = 0, (layers, k, k)
-    G: Array  # Phi' G at the densities of the projection, (k, n_s)
-    materials: tuple[LayerMaterial, ...]  # of the projection, one a layer
-    outputs: Outputs  # y = C_z a + C_s q_s
-    box: TrainingDomain  # what it was trained on
-    cells_full: int  # number of cells of the body
-    alpha: float = 0.0  # mass-proportional damping [1/s]
-    in_space: bool = False  # alpha drags the rigid motion too
-    gravity: Array | None = None  # acceleration of free fall (n_s,), or None
-    cubature_tolerance: float = 0.0  # largest |G x - b| / |b| of the cubature weights x that was asked for [1]
-    cubature_residual: float = 0.0  # |G x - b| / |b| that was reached; 0 where no cell is left out [1]
-    error_galerkin: float = 0.0  # relative error in z of the model with all cells, over the training runs [1]
-    layout: BlockLayout | None = None  # rows of the mesh that Phi has, or None
-    Phi: Array | None = None  # reconstruction z = Phi a, local rows (n_local, k), or None
-    scene_hash: str = ""  # of the scene it was made for
-    origin: dict[str, Any] = field(default_factory=dict)  # of `reduction.origin`, what that scene says of a run; or {}
-    finer: Finer | None = None  # space in which its answers are checked; None leaves them without an estimate
-    seconds: dict[str, float] = field(default_factory=dict)  # offline time by stage [s]
+    cells: Cells
+    """Sampled cells with their weights, in reduced coordinates."""
+    K_mu: Array
+    """Linear stiffness of every layer at mu = 1 Pa, lambda = 0, (layers, k, k)."""
+    K_lambda: Array
+    """Linear stiffness of every layer at lambda = 1 Pa, mu = 0, (layers, k, k)."""
+    G: Array
+    """Phi' G at the densities of the projection, (k, n_s)."""
+    materials: tuple[LayerMaterial, ...]
+    """Materials of the projection, one a layer."""
+    outputs: Outputs
+    """Names and matrices of the outputs y = C_z a + C_s q_s."""
+    box: TrainingDomain
+    """Materials, coordinates and accelerations of the training."""
+    cells_full: int
+    """Number of cells of the body."""
+    alpha: float = 0.0
+    """Mass-proportional damping [1/s]."""
+    in_space: bool = False
+    """Whether alpha damps the rigid motion too."""
+    gravity: Array | None = None
+    """Acceleration of free fall [m/s^2], (n_s,), or None."""
+    cubature_tolerance: float = 0.0
+    """Largest allowed |G x - b| / |b| of the cubature weights x [1]."""
+    cubature_residual: float = 0.0
+    """Reached |G x - b| / |b| [1]; 0 where no cell is left out."""
+    error_galerkin: float = 0.0
+    """Relative error in z of the model with all cells, over the training runs [1]."""
+    layout: BlockLayout | None = None
+    """Distribution of the mesh's rows in Phi, or None."""
+    Phi: Array | None = None
+    """Reconstruction z = Phi a, local rows (n_local, k), or None."""
+    scene_hash: str = ""
+    """Hash of the scene it was made for."""
+    origin: dict[str, Any] = field(default_factory=dict)
+    """Keys of the scene that decide on a run, see `reduction.origin`; {} for none."""
+    finer: Finer | None = None
+    """Larger space in which the error of a run is estimated; None: without an estimate."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Offline time by stage [s]."""
 
     def card(self) -> Card:
         """Dimension, cells, materials and outputs."""
@@ -275,8 +306,8 @@ class StrainModel(Shown):
 
         Args:
             dt: step [s].
-            materials: one a layer; None takes those of the projection.
-            gravity: acceleration of free fall (n_s,) [m/s^2]; None takes that of the scene.
+            materials: one a layer; None: those of the projection.
+            gravity: acceleration of free fall (n_s,) [m/s^2]; None: that of the scene.
             outside: allow what the model was not trained on.
 
         Raises:
@@ -300,5 +331,5 @@ class StrainModel(Shown):
         Raises ModelError: the model was loaded without its reconstruction.
         """
         if self.Phi is None:
-            raise ModelError("the model holds no basis on the mesh; load it with the layout of its mesh")
+            raise ModelError("the model has no basis on the mesh; load it with the layout of its mesh")
         return np.asarray(self.Phi @ a.T)

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from softgrasp.fem.petsc import Array, rows_on_root
 from softgrasp.reduction.bases.basis import ReductionError
 
-LEAST_TAU = 1e-6  # normal equations lose half of the digits, so that a smaller residual cannot be told from rounding
+LEAST_TAU = 1e-6  # normal equations lose half of the digits, so that a smaller residual may be rounding
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@
 
 solved by Broyden's method [Broyden65] on a k x k inverse, with the discrete gradient f_alg, 2 w' f_alg =
 W_r(a_{n+1}) - W_r(a_n), so that |v|^2 / 2 + W_r changes by the work 2 w'l less the loss 2 s w'D w, to the tolerance of
-the solve. `stepper.c` takes whole runs; without a compiler NumPy takes the same steps, about thirty times slower, and
-says so.
+the solve. `stepper.c` runs all steps; without a compiler NumPy runs the same steps, about thirty times slower, and
+warns.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def march_strain(problem: StrainProblem, load: Array, a0: Array, v0: Array, tol:
 
     Args:
         tol: |residual| over the largest |h| seen; rounding of the force is enough in any case.
-        engine: "C" or "NumPy"; empty takes C where there is a compiler, NumPy with a warning where not.
+        engine: "C" or "NumPy"; empty: C where there is a compiler, NumPy with a warning where not.
 
     Raises:
         SolverError: a step did not converge; names step, time, cell and law.
@@ -92,7 +92,7 @@ def _sentence(problem: StrainProblem, step: int, point: int) -> str:
         where = f"; the last trial with J <= 0 was in the cell at ({place})"
     return (
         f"the reduced model ({cells.law}) did not converge in step {step} (t = {step * problem.dt:.4g} s){where}; "
-        "take a smaller step, a stiffer material or a slower motion"
+        "use a smaller step, a stiffer material or a slower motion"
     )
 
 
@@ -172,7 +172,7 @@ class _March:
         return w
 
     def _correct(self, w: Array, R: Array, p: Array, halve: bool) -> tuple[Array, Array] | None:
-        """A correction that is taken, and the residual after it; an old inverse is renewed before any is halved."""
+        """The accepted correction, and the residual after it; an old inverse is renewed before any is halved."""
         for _ in range(HALVINGS if halve else 1):
             rest = self._residual(w + p)
             if rest is not None and np.linalg.norm(rest) < GROWTH * np.linalg.norm(R):

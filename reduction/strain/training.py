@@ -6,7 +6,7 @@ weighting [FCA15]: xi >= 0, most of them zero, with
     |sum_e xi_e g_e - sum_e g_e| <= tau |sum_e g_e|,   g_e = the cell's part of dW_r/da, stacked over training states.
 
 The states are those of the model on all cells, which is what the sampled one is to repeat. tau is half of that model's
-own error unless another is asked for: a smaller one would cost cells that the basis makes nothing of. Twice the columns
+own error unless another is given: a smaller one would need more cells without a smaller error. Twice the columns
 and cells sampled for them go with every model, to estimate the error of its answers (`indicator.py`).
 
 Errors: everything comes from small products with the snapshots, made once for a basis and all that begin it:
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 SNAPSHOTS = 400  # behind a basis, of all runs together
 STATES = 80  # of each run behind the weights
-ENTRIES = 1 << 26  # of the matrix of their forces, which one rank takes: 512 MB
+ENTRIES = 1 << 26  # of the matrix of their forces, which one rank stores: 512 MB
 TAUS = (1e-4, 3e-2)  # least and largest tau chosen from the error of the model on all cells
 
 
@@ -59,9 +59,12 @@ TAUS = (1e-4, 3e-2)  # least and largest tau chosen from the error of the model 
 class StrainErrors:
     """Relative errors over the snapshots of one full run, or of several, dimensionless."""
 
-    z: float  # |Z - Phi A|_F / |Z|_F of the deformation
-    v: float  # |V - Phi A'|_M / |V|_M of its velocity
-    energy_norm: float  # of (z, v) in (z' K_ee z + v' M_ee v)^(1/2), K_ee at rest
+    z: float
+    """Error |Z - Phi A|_F / |Z|_F of the deformation."""
+    v: float
+    """Error |V - Phi A'|_M / |V|_M of its velocity."""
+    energy_norm: float
+    """Error of (z, v) in the norm (z' K_ee z + v' M_ee v)^(1/2), K_ee at rest."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +152,7 @@ class Training:
     cells: Cells  # all cells of this rank
     offset: int  # number of this rank's first cell
     references: tuple[Reference, ...]  # the runs in terms of the basis
-    seconds: float = 0.0  # spent on the basis
+    seconds: float = 0.0  # of the computation of the basis [s]
     _galerkin: dict[int, tuple[StrainRun, ...]] = field(default_factory=dict)
     _spent: dict[int, dict[str, float]] = field(default_factory=dict)
 
@@ -224,7 +227,7 @@ class Training:
 
         Args:
             N: the hand's 2 n_s and two for each displacement.
-            tau: of the weights; None takes half of the Galerkin error, within 1e-4 and 3e-2.
+            tau: of the weights; None: half of the Galerkin error, within 1e-4 and 3e-2.
 
         Raises:
             ReductionError: N does not fit, or no weights reach tau.
@@ -299,7 +302,7 @@ def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
     """Phi' M Phi = I: POD of z, of one run with v too, in the mass product. Collective.
 
     Local rows of k columns and of as many again as the snapshots carry, up to :data:`COLUMNS` k. Both weigh the same:
-    the velocities of one run hold shapes that its displacements pass too fast; several runs have these shapes, and
+    the velocities of one run contain shapes that its displacements pass too fast; several runs have these shapes, and
     their velocities would only crowd out the soft ones.
 
     Raises BasisError: the snapshots carry fewer columns, or are zero or not finite.
@@ -315,7 +318,7 @@ def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
     part = pod_part("deformation", rows, X, (mass,), "tsqr", (0,), COLUMNS * k)
     if k > part.rank:
         most = 2 * (layout.n_s + part.rank)
-        raise BasisError(f"more displacements than the snapshots carry above rounding; ask for N <= {most}", most=most)
+        raise BasisError(f"more displacements than the snapshots carry above rounding; request N <= {most}", most=most)
     (columns,) = part.columns(min(COLUMNS * k, part.rank))
     return columns.e_q
 
@@ -363,7 +366,7 @@ def _replay(small: ReducedStrainSystem, full: FullRun) -> StrainRun:
 def errors_strain(rom: StrainModel, reduced_run: ReducedTrajectory, full: FullRun) -> StrainErrors:
     """Errors of deformation, velocity, energy norm, see :func:`softgrasp.reduction.reduce.errors`. Collective."""
     if rom.Phi is None:
-        raise ModelError("the model holds no basis on the mesh; load it with the layout of its mesh")
+        raise ModelError("the model has no basis on the mesh; load it with the layout of its mesh")
     return reference_of(full, rom.Phi).errors(*coordinates(reduced_run))
 
 

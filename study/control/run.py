@@ -5,30 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, Unpack, cast
 
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TaskProgressColumn
 
-from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.owned import remove_own
-from softgrasp.fem.scene.control import Loop
+from softgrasp.fem import Loop, Model, Stopwatch, remove_own, scene_hash
 from softgrasp.fem.solve.stiffness import sharing_factors
+from softgrasp.lqr import A_PRIORI, Design, PlantState, control_of, finite_problem, linearised, with_control
 from softgrasp.lqr.design.duration import plan
-from softgrasp.lqr.design.feedback import Design, design
-from softgrasp.lqr.design.linearise import finite_problem, linearised
+from softgrasp.lqr.design.feedback import design
 from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, reduce_gains
-from softgrasp.lqr.design.scene import control_of, with_control
-from softgrasp.lqr.plant.gain import PlantState
-from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control import measure, report
 from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
-from softgrasp.study.pictures.background import draw_in_background
-from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Flags, Page, Session
+from softgrasp.study.pictures import Frames, draw_in_background
+from softgrasp.study.report import Page
+from softgrasp.study.shell import Flags, Session, folder_lock
 
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 
@@ -68,15 +61,20 @@ def run_control(
             word = "going on from" if exists else "interrupted, the same command goes on from"
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
         plant = linearised(model)
-        study: GainStudy | None = None
+        observed, study = None, cast(GainStudy | None, None)
         with sharing_factors(plant.system):
             feedback = design(plant, watch, solver_bar(bar, model), restart)
+            if control_of(model).observer is not None:  # first: what has no observer is refused at once
+                from softgrasp.study.control.observer.measure import observed_study  # no other scene needs it
+
+                observed = observed_study(feedback, watch)
             if gain_only:
                 study = small_study(feedback, watch, sentence)
         if study is None:
             study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence)
             if retune:
                 study = with_retuning(model, study, watch, bar)
+    study = replace(study, observed=observed)
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
         saved = measure.save_controllers(study, out, end_state(model, study))

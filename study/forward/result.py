@@ -8,15 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem.columns import Columns, hand_columns
-from softgrasp.fem.mesh.check import counted
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.petsc import PETSc
-from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import Columns, Model, PETSc, Scene, Trajectory, counted, hand_columns, make_outputs
+from softgrasp.study.report import Table
 from softgrasp.study.report.origin import origin, peak_memory_mb
-from softgrasp.study.report.tables import Table
 
 if TYPE_CHECKING:
     from softgrasp.fem.run.contact_record import ContactRecord
@@ -184,7 +178,7 @@ def contact_keys(contact: ContactRecord) -> dict[str, Any]:
                 "gap_min": float(contact.gap[:, o].min()),
                 "touch_share": float((contact.touching[:, o] > 0).mean()),
                 "force_max": float(np.linalg.norm(contact.force[:, o], axis=1).max()),
-                "force_end": contact.force[-1, o].tolist(),
+                "force_end": contact.force_end[o].tolist(),
                 "impulse": contact.impulse[:, o].sum(axis=0).tolist(),
                 "nodes_max": int(contact.touching[:, o].max()),
             }
@@ -198,7 +192,7 @@ def contact_rows(contact: ContactRecord) -> list[tuple[str, str]]:
     rows = []
     for o, name in enumerate(contact.names):
         count, gap = int(contact.touching[:, o].max()), float(contact.gap[:, o].min())
-        force = ", ".join(f"{x:.4g}" for x in contact.force[-1, o])
+        force = ", ".join(f"{x:.4g}" for x in contact.force_end[o])
         touched = (
             f"force ({force}) N at the end, at most {counted(count, 'node')} touching"
             if count

@@ -20,10 +20,9 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from matplotlib.tri import Triangulation
 
-from softgrasp.fem.columns import Array
-from softgrasp.fem.fields.picture import PictureMesh
+from softgrasp.fem import Array, PictureMesh
 from softgrasp.study.pictures import shapes, style
-from softgrasp.study.pictures.style import colour_map, length_unit, paper_style, save
+from softgrasp.study.pictures.style import colour_map, length_unit, paper_style, pressure_unit, save
 
 MANY_CELLS = 300_000  # above, a picture shows the outline only
 PAD, GAP, LINE = 0.1, 0.14, 0.18  # around the scene, between panels, height of a line of text [inch]
@@ -38,7 +37,12 @@ class Shot:
     """What every view of one move shares."""
 
     picture: PictureMesh  # the body
+    states: Array  # absolute vertex displacements at the instants, shape (k, n, d) [m]
+    times: Array  # instants, shape (k,) [s]
     hands: Array  # hand coordinates at the instants, shape (k, n_s)
+    tractions: Array | None  # traction of contact on the vertices at the instants, shape (k, n, d) [Pa], if any
+    pressure: float  # largest length of a traction at any instant of the move [Pa]
+    room: Array  # corners of the scene in space without obstacles, (2, d) [m]
     path: Array  # where the grip of the hand passes, shape (steps, d) [m]
     norm: Any  # scale of the colours [unit]; from 0 to 0 when nothing deforms
     unit: tuple[float, str]  # factor and name of the unit of the colours
@@ -53,7 +57,14 @@ class Shot:
         return np.asarray(self.unit[0] * np.linalg.norm(displacement - self.picture.rigid(q_s), axis=1))
 
 
-def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, target: npt.ArrayLike | None) -> Shot:
+def make_shot(
+    picture: PictureMesh,
+    states: Array,
+    times: Array,
+    table: Array,
+    target: npt.ArrayLike | None,
+    tractions: Array | None = None,
+) -> Shot:
     """Prepare the views of a move; see `figure_move` for the arguments."""
     hands, given = shapes.hands_at(table, times), np.asarray([] if target is None else target, dtype=np.float64)
     aim = None if target is None else np.pad(given, (0, picture.n_s - len(given)))
@@ -69,14 +80,29 @@ def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, t
     boxes += [_box(np.vstack(shapes.moved(picture, polygons, q))) for q in hands if polygons]
     if aim is not None:
         boxes += [_box(p) for p in shapes.moved(picture, [picture.points, *polygons], aim)]
-    low, high = _box(np.vstack(boxes))
+    box, room = _box(np.vstack(boxes)), np.array([f(np.add(picture.points, states), (0, 1)) for f in (np.min, np.max)])
+    if picture.obstacles:
+        from softgrasp.study.pictures.obstacles import extent  # few scenes have any
+
+        box = extent(picture.obstacles, times, room, box)
+    low, high = box
+    pressure = 0.0 if tractions is None else float(np.linalg.norm(tractions, axis=2).max())
     lines = [] if aim is None else outline(picture, picture.points + picture.rigid(aim))
     edges = [picture.facets, shapes.interfaces(picture)] if picture.dimension == 2 else [np.zeros((0, 2), dtype=int)]
-    return Shot(picture, hands, path, norm, unit, low, high, polygons, np.vstack(edges), lines)
+    return Shot(
+        picture, states, times, hands, tractions if pressure > 0 else None, pressure, room, path, norm, unit, low, high,
+        polygons, np.vstack(edges), lines,
+    )  # fmt: skip
 
 
 def figure_move(
-    picture: PictureMesh, states: Array, times: Array, table: Array, target: npt.ArrayLike | None, out_png: Path
+    picture: PictureMesh,
+    states: Array,
+    times: Array,
+    table: Array,
+    target: npt.ArrayLike | None,
+    out_png: Path,
+    tractions: Array | None = None,
 ) -> tuple[Path, ...]:
     """The deformed body at a few instants with hand, path and target; PNG and PDF, whose names are returned.
 
@@ -89,16 +115,18 @@ def figure_move(
         table: the whole hand motion, columns time and q_s, shape (steps, 1 + n_s) [s, m, rad].
         target: hand coordinates aimed at, d or n_s entries, or None.
         out_png: name of the picture; the PDF gets its stem.
+        tractions: of contact at the vertices, shape (k, n, d) [Pa], or None.
     """
     chosen = shapes.pick_instants(picture, states, times, table)
     states, times = states[chosen].astype(np.float64), times[chosen]
-    shot = make_shot(picture, states, times, table, target)
+    shot = make_shot(picture, states, times, table, target, None if tractions is None else tractions[chosen])
     with paper_style():
         meet = picture.dimension == 3 or shapes.overlap(picture, states)  # in 3D captions meet bodies
         apart = len(states) > 1 and meet
         groups = [[i] for i in range(len(states))] if apart else [list(range(len(states)))]
         figure, axes = make_axes(shot, len(groups), captions=True)
         for ax, group in zip(axes, groups, strict=True):
+            draw_surroundings(ax, shot, group)
             draw_scene(ax, shot, states[group], None if apart else times[group], shot.hands[group])
             if apart:
                 ax.set_title(_time(times[group[0]]), pad=3)
@@ -106,6 +134,14 @@ def figure_move(
         colour_bar(figure, axes, shot)
         legend(figure, axes, shot)
         return save(figure, out_png)
+
+
+def draw_surroundings(ax: Any, shot: Shot, numbers: list[int]) -> None:
+    """Obstacles at the instants with these numbers, and the pressure of contact on the bodies."""
+    if shot.picture.obstacles:
+        from softgrasp.study.pictures.obstacles import draw_surroundings as draw  # few scenes have any
+
+        draw(ax, shot, numbers)
 
 
 def draw_scene(ax: Any, shot: Shot, states: Array, times: Array | None, hands: Array) -> None:
@@ -164,11 +200,6 @@ def make_axes(
         if solid:
             ax.set_axis_off()
             continue
-        if shot.picture.obstacles:
-            from softgrasp.study.pictures.obstacles import draw_obstacle  # few scenes have any
-
-            for obstacle in shot.picture.obstacles:
-                draw_obstacle(ax, obstacle.shape, obstacle.name, np.array([low, high]))
         ax.xaxis.set_major_locator(MaxNLocator(int(np.clip(w / 0.5, 2, 6)), steps=style.STEPS))
         ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(h / 0.4, 2, 6)), steps=style.STEPS))
         ax.tick_params(labelbottom=i // columns == rows - 1, labelleft=i % columns == 0)
@@ -207,6 +238,10 @@ def legend(figure: Any, axes: list[Any], shot: Shot) -> None:
         entries.append(Patch(color=colour_map()(0.0), label="tissue, not deformed"))
     if np.ptp(shot.path, axis=0).max() > 0:
         entries.append(Line2D([], [], ls=DASHES, color=style.OUTLINE, lw=0.9, label="path of the hand"))
+    if shot.tractions is not None and shot.picture.dimension == 2:
+        factor, unit = pressure_unit(shot.pressure)
+        label = f"pressure, at most {factor * shot.pressure:.3g} {unit}"
+        entries.append(Line2D([], [], ls="", marker=r"$\rightarrow$", ms=9, color=style.HAND, label=label))
     if shot.aim:
         entries.append(Line2D([], [], ls=DOTS, color=style.TARGET, lw=1.3, label="target"))
     title = LINE if axes[0].get_title() else 0.0

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from softgrasp.fem import Array, Model, Run, SeriesWriter, Trajectory, frame_steps, note_of, remove_own, total
 from softgrasp.fem.checksums import AGAIN, read_arrays, write_arrays
 from softgrasp.fem.errors import CheckpointError, raise_on_all_ranks
-from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
-from softgrasp.fem.fields.series import SeriesWriter
-from softgrasp.fem.fields.vtu import note_of
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.owned import remove_own
-from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.frames import frame_steps
-from softgrasp.fem.run.simulate import Run
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.fields.picture import gather_picture, vertex_displacement, vertex_values
 from softgrasp.study.pictures.shapes import way_done
+
+if TYPE_CHECKING:
+    from softgrasp.fem.fields.traction import ContactTraction
 
 MANY_VERTICES = 50_000  # above, only the instants of the still picture are kept
 LARGE_RESTART = 2**26  # bytes: no room is kept for a larger restart file, it would stop runs that end well
@@ -47,6 +44,12 @@ class Frames:
         self.times: list[float] = []
         self.hands: list[Array] = []
         self.states: list[np.ndarray] = []
+        self.tractions: list[np.ndarray] = []  # of contact at the vertices, where the scene has it
+        self.traction: ContactTraction | None = None
+        if model.scene.effects.obstacles:
+            from softgrasp.fem.fields.traction import ContactTraction  # only scenes with contact pay for it
+
+            self.traction = ContactTraction(model)
 
     def begin(self, run: Run) -> None:
         """Join the legs that led here: field files get their name, pictures what lies beside the checkpoint.
@@ -83,6 +86,8 @@ class Frames:
             self.times.append(float(frame["t"]))
             self.hands.append(frame["hand"])
             self.states.append(frame["state"])
+            if "traction" in frame:
+                self.tractions.append(frame["traction"])
         self.saved = len(self.steps)
 
     def keep(self, run: Run) -> None:
@@ -97,6 +102,7 @@ class Frames:
                 for i in range(self.saved, len(self.states)):
                     name = f"{run.name}-frame{self.steps[i]}.npz"
                     frame = {"step": self.steps[i], "t": self.times[i], "hand": self.hands[i], "state": self.states[i]}
+                    frame |= {"traction": self.tractions[i]} if self.tractions else {}
                     run.beside[name] = write_arrays(self.directory / "checkpoint" / name, frame)
             except OSError as error:
                 text = f"{self.directory}: the frames cannot be written ({error}); free the disk"
@@ -120,6 +126,9 @@ class Frames:
         size = float(total(run.layout.comm, np.array([np.dot(z, z)]))[0])
         if size > self.most[0]:
             self.most = size, t, z.copy()
+        traction = None
+        if self.traction is not None and run.contact is not None:
+            traction = self.traction(run.contact.surface, run.contact.pressing())
         if self.pictures and (not self.few or run.reached in self.chosen):
             state = vertex_displacement(self.model, z, q_s)
             self.steps.append(run.reached)
@@ -127,9 +136,12 @@ class Frames:
             self.hands.append(q_s.copy())
             if state is not None:
                 self.states.append(state.astype(np.float32))
+            if traction is not None and (at_vertices := vertex_values(self.model, traction)) is not None:
+                self.tractions.append(at_vertices.astype(np.float32))
         if self.writer is not None:  # last: when there is no room, the rest goes beside the restart file
             reserve = run.layout.comm.allreduce(run.restart_state().size) if isinstance(run, Run) else 0
-            self.writer.write(t, z, v, q_s, v_s, reserve=reserve if reserve < LARGE_RESTART else 0)
+            reserve = reserve if reserve < LARGE_RESTART else 0
+            self.writer.write(t, z, v, q_s, v_s, traction=traction, reserve=reserve)
 
     def _ahead(self, run: Run) -> set[int]:
         """Steps of the still picture before they are reached; the hand's table is known unless forces drive it."""
@@ -156,15 +168,21 @@ class Frames:
 
         picture, target = self.picture, self.model.scene.motion.target
         table, states, times = np.column_stack([run.times, run.q_s]), np.stack(self.states), np.array(self.times)
+        tractions = np.stack(self.tractions) if self.tractions else None
 
         def moving(out: Path) -> list[Path]:
-            return [] if self.few else [gif_move(picture, states, times, table, target, out / "move.gif")]
+            return [] if self.few else [gif_move(picture, states, times, table, target, out / "move.gif", tractions)]
 
         moved = draw_in_background(self.model.system.layout.comm, directory, moving)
-        files = [*figure_move(picture, states, times, table, target, directory / "move.png")]
+        files = [*figure_move(picture, states, times, table, target, directory / "move.png", tractions)]
         rigid, d = run.outputs_rigid, picture.dimension
         figure = traces(run.times, run.outputs, run.columns, run.q_s, rigid=rigid, dimension=d)
-        return [*files, *save(figure, directory / "traces.png"), *moved()]
+        files += save(figure, directory / "traces.png")
+        if run.contact is not None:
+            from softgrasp.study.pictures.contact import figure_contact
+
+            files += figure_contact(run.times, run.contact, directory / "contact.png")
+        return [*files, *moved()]
 
 
 def _series(begun: int) -> str:

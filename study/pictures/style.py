@@ -15,8 +15,8 @@ import numpy as np
 from cycler import cycler
 from PIL import Image
 
-from softgrasp.fem.owned import note
-from softgrasp.study.pictures import PDF
+from softgrasp.fem import note
+from softgrasp.study.pictures.pdf import PDF
 
 if "inline" not in os.environ.get("MPLBACKEND", ""):  # a notebook shows figures by its own
     mpl.use("Agg")
@@ -166,3 +166,10 @@ def length_unit(largest: float) -> tuple[float, str]:
     if largest >= 0.1 or largest == 0.0:
         return 1.0, "m"
     return (1e3, "mm") if largest >= 1e-4 else (1e6, "µm")
+
+
+def pressure_unit(largest: float) -> tuple[float, str]:
+    """Factor and name of the unit in which a pressure in pascal reads well."""
+    return next(
+        (f, unit) for f, unit, least in ((1e-6, "MPa", 1e6), (1e-3, "kPa", 1e3), (1.0, "Pa", 0.0)) if largest >= least
+    )

@@ -58,7 +58,7 @@ def test_rows_are_written_as_they_come_and_resumed(tmp_path: Path, monkeypatch: 
     other.resume()
     assert not other.rows  # another damping is another table
     file.write_text('{"beta": 0.02, "rows": [{"nx": 10}], "peers": []}')
-    with pytest.raises(CheckpointError, match="holds no rows of this version"):
+    with pytest.raises(CheckpointError, match="has no rows of this version"):
         other.resume()
 
 

@@ -167,7 +167,7 @@ def test_modal_lqr_with_all_modes_is_the_full_solution() -> None:
 
 def test_modal_lqr_does_not_promise_what_cannot_be() -> None:
     problem = make({"control": {"outputs": [{"kind": "hand"}]}})
-    with pytest.raises(ControlError, match="only 0 of the lowest 40 modes can be stabilised, 10 are asked for"):
+    with pytest.raises(ControlError, match="only 0 of the lowest 40 modes can be stabilised, 10 are requested"):
         modal_lqr(problem)
     with pytest.raises(ControlError, match="modes = -1 must be 0 or more"):
         modal_lqr(problem, -1)

@@ -143,7 +143,7 @@ def test_a_file_of_an_earlier_version_is_read_and_says_what_it_lacks(folder: Pat
         file.attrs["model"] = json.dumps(about)
         write_checksums(file)
     model, run = built(*[STRAIN] * (kind == "strain"))
-    with pytest.warns(RuntimeWarning, match="does not hold what it was built from"):
+    with pytest.warns(RuntimeWarning, match="does not name its scene"):
         found = sg.replay(sg.load(path), model, run)
     assert np.array_equal(found.outputs, sg.replay(reduced(kind, folder), model, run).outputs)
 

@@ -8,17 +8,17 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import LineCollection
+from matplotlib.patheffects import withStroke
 from scipy.spatial import cKDTree
 
-from softgrasp.fem.columns import AXES
-from softgrasp.fem.fields.picture import PictureMesh
-from softgrasp.lqr.design.constrained import PlannedControl
+from softgrasp.fem import AXES, PictureMesh
+from softgrasp.lqr import PlannedControl
 from softgrasp.study.control.obstacle.result import PlannedStudy
-from softgrasp.study.pictures import style
-from softgrasp.study.pictures.obstacles import draw_obstacle
+from softgrasp.study.pictures import draw_obstacle, style
 
 SHOWN = (0.0, 0.12, 0.28, 0.45, 0.62, 0.8, 1.0)  # shares of the way at which the body is drawn
 MANY = 2000  # points of a line; in print more of them coincide
+HALO = [withStroke(linewidth=2.5, foreground="white")]  # keeps times readable on lines
 LIMIT: dict[str, Any] = {"color": "#999999", "lw": 0.8, "ls": (0, (4, 2))}
 
 
@@ -55,7 +55,16 @@ def figure_bodies(planned: PlannedControl, picture: PictureMesh, out_png: Path) 
         for colour, n in zip(colours, instants, strict=True):
             ax.add_collection(LineCollection(lines[n][edges], colors=[colour], lw=1.3, zorder=3))
             x, y = centre[n]
-            ax.text(x, y, f"{runs.planned.times[n]:.3g} s", ha="center", va="center", fontsize=7)
+            ax.text(
+                x,
+                y,
+                f"{runs.planned.times[n]:.3g} s",
+                ha="center",
+                va="center",
+                fontsize=7,
+                zorder=4,
+                path_effects=HALO,
+            )
         ax.plot(*centre[:: max(1, len(centre) // MANY)].T, color=style.HAND, lw=0.7, ls=(0, (1, 1.2)), zorder=2)
         ax.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal", xlabel="$x$ [m]", ylabel="$y$ [m]")
         return style.save(figure, out_png)

@@ -8,17 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.columns import AXES
-from softgrasp.lqr.constrained.plan import Plan
+from softgrasp.fem import AXES
+from softgrasp.lqr import Plan
 from softgrasp.study.control.obstacle.result import PlannedStudy
-from softgrasp.study.report.page import Section, captioned
-from softgrasp.study.report.tables import Table, listed
+from softgrasp.study.report import Section, Table, captioned, listed
 
 CAPTIONS = {
     "obstacle.png": "The boundary of the body on the full plant under the plan, and the way of its middle; grey and "
     "dashed: under the optimal feedback, which knows no obstacle, where it is deepest inside.",
-    "gaps.png": "Gap of the body to every obstacle on the full plant, with the margin of the plan; force and speed "
-    "of the hand with their limits.",
+    "gaps.png": "Gap of the body to every obstacle on the full plant. Dashed: clearance and margin, which the reduced "
+    "plant keeps; the full plant may use the margin up. Below: force and speed of the hand with their limits.",
 }
 GAPS = ("obstacle", "least gap [m]", "at [s]", "without the plan [m]")
 
@@ -57,7 +56,8 @@ def plan_table(study: PlannedStudy) -> Table:
 def sentence(study: PlannedStudy) -> str:
     """What came out."""
     plan = study.planned.plan
-    cost = f"It costs {study.excess:.2%} more than the optimal feedback without obstacles and limits."
+    paid = study.planned.runs.planned.cost
+    cost = f"The plan costs {paid:.4g}, {study.excess:.2%} more than the optimal feedback without obstacles and limits."
     if plan.certified:
         return f"The full linear plant keeps every gap and limit under the plan at every time: this is proved. {cost}"
     run = "keeps" if study.kept else "does not keep"
@@ -82,7 +82,7 @@ def facts(study: PlannedStudy) -> list[tuple[str, str]]:
             ("margin between two instants", f"{plan.bend:.2g} m where a gap holds the plan"),
             ("clearance", f"{task.clearance:.3g} m"),
             ("error of the run's own step", f"{runs.step_error:.2g} m, measured against the exact modes"),
-            ("cost of a metre of one row", f"{plan.multiplier:.3g} at most"),
+            ("cost of a metre of one gap at one instant", f"{plan.multiplier:.3g} at most"),
         ]
     rows += [
         ("excess cost", f"{study.excess:.3%}, of which held forces {study.excess_held:.3%}"),

@@ -348,7 +348,7 @@ def test_multiple_modes_are_all_found(comm: MPI.Intracomm) -> None:
 
 def test_modes_refuse(comm: MPI.Intracomm) -> None:
     system = build(scene_of(), comm=comm).system
-    with pytest.raises(SolverError, match="0 modes are asked for"):
+    with pytest.raises(SolverError, match="0 modes are requested"):
         lowest_modes(system, 0)
     with pytest.raises(SolverError, match="between 1 and n_e"):
         lowest_modes(system, system.layout.n_e + 1)

@@ -51,8 +51,8 @@ def test_what_the_sentence_advises_fits(comm: MPI.Intracomm) -> None:
     big = make_scene(tissue={"cells": [3000, 6000]}, output={"memory": 0.5})
     with pytest.raises(ResourceError) as caught:
         build(big, comm=comm)
-    assert "where 512 MiB may be taken" in str(caught.value)
-    text = str(caught.value).split("take about tissue.cells = ")[1].split(" or less")[0]
+    assert "where 512 MiB may be used" in str(caught.value)
+    text = str(caught.value).split("use about tissue.cells = ")[1].split(" or less")[0]
     cells = [int(n) for n in text.strip("[]").split(", ")]
     assert cells[1] == pytest.approx(2 * cells[0], rel=0.1)  # two digits are kept
     some = make_scene(tissue={"cells": cells}, output={"memory": 0.5})
@@ -65,7 +65,7 @@ def test_a_graded_mesh_that_does_not_fit_is_refused(comm: MPI.Intracomm) -> None
     """What says how many cells there are is the tolerance, not the cells of the box."""
     scene = make_scene(tissue={"order": 2, "refine": {"tolerance": 1e-2}}, output={"memory": 1e-3})
     with pytest.raises(
-        ResourceError, match=r"^tissue\.refine\.tolerance = 0\.01 needs .* take about \d+ of its \d+ cells"
+        ResourceError, match=r"^tissue\.refine\.tolerance = 0\.01 needs .* use about \d+ of its \d+ cells"
     ):
         build(scene, comm=comm)
 
@@ -73,7 +73,7 @@ def test_a_graded_mesh_that_does_not_fit_is_refused(comm: MPI.Intracomm) -> None
 def test_steps_count_only_for_a_run(comm: MPI.Intracomm) -> None:
     scene = make_scene(time={"steps": 10**12})
     assert build(scene, comm=comm, run=False).system.layout.n_e > 0
-    with pytest.raises(ResourceError, match=r"take about time\.steps = \d+ or less"):
+    with pytest.raises(ResourceError, match=r"use about time\.steps = \d+ or less"):
         build(scene, comm=comm)
 
 

@@ -27,7 +27,7 @@ def outputs(*entries: dict[str, Any]) -> dict[str, Any]:
         ([0.375, 0.25], "node (0.25, 0.25), one of 2 equally near to (0.375, 0.25)"),
         ([0.375, 0.375], "node (0.25, 0.25), one of 4 equally near to (0.375, 0.375)"),
         ([0.3, 0.25], "node (0.25, 0.25), nearest to (0.3, 0.25)"),
-        ([0.0, 2.0], "node (0.25, 2), nearest to (0, 2); the hand holds a nearer one"),
+        ([0.0, 2.0], "node (0.25, 2), nearest to (0, 2); a nearer one is bonded to the hand"),
     ],
 )
 def test_the_node_that_is_taken_is_named(comm: MPI.Intracomm, point: list[float], place: str) -> None:
@@ -69,7 +69,7 @@ def test_nodes_of_a_region_that_the_hand_holds_count(
     scene = make_scene(tables, outputs({"kind": "region", "box": box, "name": "part"}), time={"steps": 40})
     model = build(scene, comm=comm)
     (output,) = make_outputs(scene, model.system)
-    assert output.place == f"mean of {count} nodes" + (f", {held} of them held by the hand" if held else "")
+    assert output.place == f"mean of {count} nodes" + (f", {held} of them bonded to the hand" if held else "")
     run = simulate(model)
     assert run.snapshots is not None
     layout, d = model.system.layout, model.system.layout.dimension

@@ -158,16 +158,17 @@ def test_a_free_hand_rests_with_its_weight_on_the_table() -> None:
 
 
 @pytest.mark.parametrize("overrides", [[TABLE, BETA], [DISC, *TWO, *SHORT], [DISC, *SHORT]])
-def test_restart_in_contact_repeats_the_bits(overrides: list[str], tmp_path: Path) -> None:
+def test_restart_in_contact_repeats_the_bits(overrides: list[str], mpi_tmp_path: Path) -> None:
     whole, model = run(*overrides), build("paper_forward", [*SMALL, ON, *overrides])
     with pytest.raises(Paused):
-        simulate(model, RunOptions(tmp_path, until=101))
-    again = simulate(build("paper_forward", [*SMALL, ON, *overrides]), RunOptions(tmp_path, resume=True))
+        simulate(model, RunOptions(mpi_tmp_path, until=101))
+    again = simulate(build("paper_forward", [*SMALL, ON, *overrides]), RunOptions(mpi_tmp_path, resume=True))
     assert whole.contact.touching[:101].max() > 0
     assert np.array_equal(again.final, whole.final)
     for name in ("force", "impulse", "gap", "touching"):
         assert np.array_equal(getattr(again.contact, name), getattr(whole.contact, name))
     assert again.energy_drift == whole.energy_drift
+    assert again.contact.touch == whole.contact.touch
 
 
 @pytest.mark.ranks(3)
@@ -209,6 +210,24 @@ REFUSED = [
 ]
 
 
+@pytest.mark.ranks(2)
+@pytest.mark.parametrize("overrides", [[SLANTED, BETA], [TABLE, SPACE, *TWO]])
+def test_compiled_half_spaces_are_those_of_the_general_step(
+    overrides: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled = run(*overrides)
+    monkeypatch.setattr("softgrasp.fem.run.contact_step.contact_library", lambda: None)
+    general = run(*overrides)
+    assert general.contact.rounds >= compiled.contact.rounds > 0
+    # two orders of the same sums, over 300 steps in which nodes touch and leave
+    assert np.abs(compiled.final - general.final).max() < 1e-9 * np.abs(general.final).max()
+    assert compiled.contact.stopped == pytest.approx(general.contact.stopped, rel=1e-9)
+    assert compiled.contact.touch == pytest.approx(general.contact.touch, rel=1e-9, abs=1e-15)
+    assert np.array_equal(compiled.contact.touching, general.contact.touching)
+    scale = np.abs(general.force).max()
+    assert np.abs(compiled.force - general.force).max() <= 1e-6 * scale  # impulses over dt: sums that cancel
+
+
 @pytest.mark.parametrize(("overrides", "words"), REFUSED)
 def test_what_contact_cannot_do_is_refused(overrides: list[str], words: str) -> None:
     with pytest.raises(SceneError) as error:
@@ -220,6 +239,6 @@ def test_a_start_inside_and_a_hand_that_meets_an_obstacle_are_refused() -> None:
     with pytest.raises(SceneError, match=r"obstacle 'disc1' holds the node of the tissue at .* m deep; move it"):
         run("obstacle=[{kind='disc', center=[0.5, 0.2], radius=0.3}]")
     model = build("paper_forward", [*SMALL, ON, TABLE])
-    held = model.system.layout.held[0].tolist()
+    held = np.concatenate(MPI.COMM_WORLD.allgather(model.system.layout.held))[0].tolist()
     with pytest.raises(SoftgraspError, match="the hand meets obstacle 'disc1' at t = 0 s"):
         run(f"obstacle=[{{kind='disc', center={held}, radius=0.01}}]")

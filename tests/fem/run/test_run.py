@@ -334,5 +334,5 @@ def test_streamed_snapshots_of_another_stride_do_not_resume(comm: MPI.Intracomm,
 
 
 def test_steps_longer_than_the_move_are_refused(comm: MPI.Intracomm) -> None:
-    with pytest.raises(SceneError, match=r"time\.steps = 20 .* take at least 200"):
+    with pytest.raises(SceneError, match=r"time\.steps = 20 .* use at least 200"):
         simulate(small(comm, "time.steps=20", "time.end=300.0", scene="paper_lqr"))

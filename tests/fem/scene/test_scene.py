@@ -150,12 +150,12 @@ REFUSED: list[tuple[Path, list[str], str]] = [
     (PAPER, ["control.Q=[[1.0, 2.0], [0.0, 1.0]]"], "control.Q is not symmetric"),
     (PAPER, ["control.Q=[[1.0, 2.0], [2.0, 1.0]]"], "control.Q has the eigenvalue -1; all must be >= 0"),
     (PAPER, ["control.R=[[1.0, 1.0], [1.0, 1.0]]"], "all must be > 0"),
-    (PAPER, ["tissue.refine={tolerance=1e-10}"], "below 1e-09 rounding decides, take a larger one"),
+    (PAPER, ["tissue.refine={tolerance=1e-10}"], "below 1e-09 rounding decides, use a larger one"),
     # --set itself
     (PAPER, ["hand.mass"], "--set hand.mass: it must read section.key=value"),
     (PAPER, ["hand..mass=1"], "it must read section.key=value"),
     (PAPER, ["hand.mass=1 2"], "'1 2' is not a TOML value"),
-    (PAPER, ["hand.mass=1\nb = 2"], "it must hold one value"),
+    (PAPER, ["hand.mass=1\nb = 2"], "it must have one value"),
     (PAPER, ["hand.mass.kg=1"], "hand.mass is 20.0, no table; set hand.mass itself"),
     (PAPER, ["control.outputs.1.name=a"], "'1' must be an index below 1"),
 ]
@@ -197,6 +197,7 @@ def test_shipped_scene_loads_and_survives_its_resolved_text(name: str, tmp_path:
 
 def test_scenes_that_checks_name_are_shipped() -> None:
     wanted = {"paper_forward", "paper_lqr", "paper_lqr_undamped", "franka_muscle", "block_3d", "pillow_3d", "layers_2d"}
+    wanted |= {"paper_accurate", "paper_obstacle", "set_down", "push_disc", "set_down_3d"}
     assert wanted <= SCENES.keys()
     assert PILLOW.parent.joinpath("meshes", "pillow_small.LICENSE").is_file()
 

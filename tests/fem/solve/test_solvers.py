@@ -81,4 +81,4 @@ class Counting:
 @pytest.mark.parametrize(("name", "package"), [("cholesky", "PETSc"), ("mumps", "MUMPS"), ("cg", "GAMG")])
 def test_a_run_says_who_factored(comm: MPI.Intracomm, name: SolverName, package: str) -> None:
     run = simulate(build(make_scene(CUBE, time={"solver": name, "steps": 2}), comm=comm))
-    assert run.solver == (name, "asked for by the scene", package)
+    assert run.solver == (name, "requested by the scene", package)

@@ -173,5 +173,5 @@ def test_iterations_do_not_grow_with_the_mesh(cells: list[int], n: int) -> None:
 
 def test_linear_elements_have_no_stars(comm: MPI.Intracomm) -> None:
     system = build(make_scene(), comm=comm).system
-    with pytest.raises(SolverError, match=r"take tissue.order = 2"):
+    with pytest.raises(SolverError, match=r"use tissue.order = 2"):
         make_solver(system.K_ee.copy(), "stars", system.layout, "test_")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.obstacles.shapes import Ball, HalfSpace, Shape
 from softgrasp.fem.scene.file import load_scene
@@ -17,8 +18,8 @@ from softgrasp.lqr.constrained.horizon import HeldPlant, held_plant
 from softgrasp.lqr.constrained.least_distance import nearest
 from softgrasp.lqr.constrained.plan import Plan, Task, make_plan, quadratic_program
 from softgrasp.lqr.constrained.pulse import PulseError
-from softgrasp.lqr.constrained.rows import Limits
-from softgrasp.lqr.constrained.run import PlanRuns, plan_inputs, run_plan
+from softgrasp.lqr.constrained.rows import Limits, follow
+from softgrasp.lqr.constrained.run import PlanRuns, run_plan
 from softgrasp.lqr.constrained.tissue import ModalTissue, Surface, make_surface, modal_tissue
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.checks import ControlError
@@ -55,6 +56,14 @@ def task(N: int, *shapes: Shape, cells: str = "[10, 20]") -> tuple[HeldPlant, Ta
 def run(plan: Plan, cells: str = "[10, 20]") -> PlanRuns:
     problem, solution, surface, full = paper(cells)
     return run_plan(problem, solution, plan, surface, full, rest(problem.system), hand_target(problem, TARGET))
+
+
+def inputs_until(plan: Plan, intervals: int) -> np.ndarray:
+    """Inputs of the plan, behind its horizon those of the gain K, (intervals, n_s)."""
+    horizon = plan.horizon
+    end = horizon.state(plan.task.start, plan.c)[-1, -1]
+    _, tail = follow(horizon.plant, end, -1.0, intervals - horizon.steps)
+    return np.concatenate([plan.inputs, tail + plan.task.u_bar])
 
 
 @pytest.mark.parametrize(("N", "margin"), [(14, 1.5e-3), (22, 2.2e-4), (30, 1.2e-4)])
@@ -121,6 +130,29 @@ def test_program_of_a_plan_is_solved_as_by_least_squares() -> None:
     assert np.abs(found.x - least_squares(G[near], h[near])).max() < 1e-11  # the oracle divides by its residual
 
 
+def test_multiplier_is_what_a_metre_of_a_gap_costs() -> None:
+    plant, given = task(14, WALL, cells="[4, 8]")
+    plan = make_plan(plant, given, 30)
+    G, h = quadratic_program(plan)
+    found = nearest(G, h, plan.active)
+    nearer = h.copy()
+    nearer[np.argmax(found.multipliers)] -= 1e-6  # a micrometre less room
+    more = nearest(G, nearer, plan.active).x
+    # one more round of half-planes and bends moves it by SETTLED or so, the quotient by 1e-6 times its slope
+    assert abs(plan.multiplier / ((more @ more - found.x @ found.x) / 1e-6) - 1) < 1e-2
+    pressed = make_plan(plant, replace(given, shapes=(), names=(), limits=Limits(np.full(2, 1.0))), 30)
+    assert pressed.active
+    assert pressed.multiplier == 0  # newtons of a limit are no metres of a gap
+
+
+def test_programs_beyond_the_memory_are_refused_before_they_are_built() -> None:
+    plant, given = task(14, WALL, cells="[4, 8]")
+    with pytest.raises(
+        ResourceError, match=r"a plan of 1e\+06 intervals would take about .* control.constraints.horizon"
+    ):
+        make_plan(plant, given, 1_000_000, 1_000_000)
+
+
 def test_start_inside_an_obstacle_is_a_result() -> None:
     plant, given = task(14, HalfSpace(np.array([1.0, 0.0]), 0.1), cells="[4, 8]")  # 0.1 m over the left edge
     plan = make_plan(plant, given, 30)
@@ -137,16 +169,13 @@ def test_tail_lengthens_a_horizon_that_ends_before_the_overshoot() -> None:
     plan = make_plan(plant, given, 8)
     assert plan.certified
     assert plan.horizon.steps > 8
-    inputs = plan_inputs(plan, 60.0)
-    assert len(inputs) == 60
-    assert np.array_equal(inputs[: plan.horizon.steps], plan.inputs)
 
 
 def test_jumps_keep_their_limit() -> None:
     plant, given = task(14, WALL, cells="[4, 8]")
     free = make_plan(plant, given, 30)
     plan = make_plan(plant, replace(given, limits=Limits(jump=1.0)), 30)
-    jumps = np.abs(np.diff(plan_inputs(plan, 60.0), axis=0, prepend=0.0)).max()
+    jumps = np.abs(np.diff(inputs_until(plan, 60), axis=0, prepend=0.0)).max()
     assert np.abs(np.diff(free.inputs, axis=0, prepend=0.0)).max() > 2
     assert jumps <= 1 + 1e-9
     assert plan.certified
@@ -161,7 +190,7 @@ def test_limits_that_are_too_slow_are_refused_before_a_plan() -> None:
 
 def test_targets_without_a_gap_are_refused() -> None:
     plant, given = task(14, HalfSpace(np.array([-1.0, 0.0]), -6.0001), cells="[4, 8]")
-    with pytest.raises(ControlError, match=r"at the target the body stands 0\.0001 m off obstacle 0; a plan needs"):
+    with pytest.raises(ControlError, match=r"at the target the gap to obstacle 0 is 0\.0001 m and a plan needs"):
         make_plan(plant, given, 30)
 
 

@@ -274,7 +274,7 @@ def test_choice_names_its_reason() -> None:
     assert choose(paper_like).method == "newton_adi"
     layers = make_problem(build(make_scene(*CASES["layers"], tissue={"cells": [6, 12]}), comm=MPI.COMM_WORLD))
     assert choose(layers).method == "radi"
-    assert solve(small, "galerkin").reason == "asked for"
+    assert solve(small, "galerkin").reason == "requested"
     assert choose(small, "newton-adi").method == choose(small, "newton_adi").method == "newton_adi"  # as scenes say it
     with pytest.raises(SolverError, match="unknown"):
         solve(small, "magic")  # type: ignore[arg-type]

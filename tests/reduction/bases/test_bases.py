@@ -236,5 +236,5 @@ def test_solving_columns_undoes_the_matrix() -> None:
 
 
 def test_singular_pairs_are_refused_in_one_sentence() -> None:
-    with pytest.raises(BasisError, match="take a smaller N or another basis"):
+    with pytest.raises(BasisError, match="use a smaller N or another basis"):
         symplectic_repair(np.zeros((4, 4)))

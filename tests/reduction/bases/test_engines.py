@@ -311,7 +311,7 @@ def test_parts_share_columns_equally() -> None:
         ({"N": 3}, "N = 3 does not fit; it must be the 4 columns of the hand plus an even number"),
         ({"N": 4}, "N = 4 does not fit"),
         ({"N": 7}, "N = 7 does not fit"),
-        ({"N": 12}, "more than the snapshots carry above rounding .6 . 4 of the hand.; ask for N <= 10"),
+        ({"N": 12}, "more than the snapshots carry above rounding .6 . 4 of the hand.; request N <= 10"),
         ({"tol": 1e-3}, "cannot be kept to 1.0e-06 of its energy with the 3 singular values"),
     ],
 )

@@ -57,7 +57,7 @@ def test_a_snapshot_that_is_not_finite_is_named(comm: MPI.Intracomm, bad: float)
     if comm.rank == comm.size - 1:
         Z[3, 7] = bad
     for key in ("global_pod", "psd_fixed", "psd_svd_like_fixed", "componentwise_pod"):
-        with pytest.raises(BasisError, match=r"snapshot 7 \(step 28\) holds NaN or infinity"):
+        with pytest.raises(BasisError, match=r"snapshot 7 \(step 28\) contains NaN or infinity"):
             make_basis(key, changed(c, Z=Z), 8)
 
 
@@ -75,7 +75,7 @@ def test_duplicated_and_deficient_snapshots(key: str) -> None:
     size = 4 + (4 if METHODS[key].fixed else 0)
     many, single = (make_basis(key, states_of(c.model.system, x), size) for x in (few, once))
     assert gap(dense(many), dense(single)) < 1e-7  # the same span; rounding over the smallest gap
-    with pytest.raises(BasisError, match=r"more than the snapshots carry above rounding.*ask for N <= \d+"):
+    with pytest.raises(BasisError, match=r"more than the snapshots carry above rounding.*request N <= \d+"):
         make_basis(key, states_of(c.model.system, few), 40)
 
 

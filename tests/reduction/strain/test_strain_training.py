@@ -248,7 +248,7 @@ def test_what_does_not_fit_is_refused(own: FullRun, trained: Training) -> None:
         train(linear, [own], 14)
     with pytest.raises(ReductionError, match="N = 13"):
         trained.reduce(13)
-    with pytest.raises(BasisError, match="ask for N <="):
+    with pytest.raises(BasisError, match="request N <="):
         train(own.model, [own], 500)
     with pytest.raises(SceneError, match=r"output\.snapshots"):
         reduce(own.model, replace(own.trajectory, snapshots=None))

@@ -77,10 +77,12 @@ def test_explain_names_the_program_that_control_solves() -> None:
     [
         ("control.constraints.force=false", "control.constraints.force"),
         ("control.constraints.force=[1.0, 1.0, 1.0]", "force has 3 numbers; give one, or 2, one per axis"),
-        ("obstacle.1.offset=-5.99", "at the target the body stands -0.01 m off obstacle wall"),
+        ("obstacle.1.offset=-5.99", "at the target the gap to obstacle wall is -0.01 m"),
         ("obstacle.0.path={velocity=[0.1, 0.0]}", "obstacle.0.path moves obstacle disc"),
         ("effects.reaction=true", "a plan past obstacles is made for a hand that neither turns nor feels the tissue"),
         ("effects.gravity=[0, -0.1]", "a plan starts with the tissue in equilibrium"),
+        ("control.constraints.horizon=1e9", "a plan of 1e+09 intervals would take about"),
+        ("control.constraints.grid=1e4", "no gain is found for forces held over 10000 s"),
         ("control.constraints.N=9", "N is 9; displacements and velocities come in pairs"),
         ("control.constraints=false", "obstacle is given but nothing in this scene uses it"),
     ],

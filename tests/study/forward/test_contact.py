@@ -5,11 +5,16 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
+import matplotlib.pyplot as plt
+import meshio
 import numpy as np
 import pytest
+from matplotlib.quiver import Quiver
+from PIL import Image
 from rich.console import Console
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.fields.picture import gather_picture
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.lqr.design.scene import problem
@@ -17,6 +22,8 @@ from softgrasp.reduction.reduce import reduce
 from softgrasp.study.forward.cautions import small_obstacles
 from softgrasp.study.forward.explain import explain_model
 from softgrasp.study.forward.run import run_simulate
+from softgrasp.study.pictures.body import draw_surroundings, legend, make_axes, make_shot
+from softgrasp.study.pictures.shapes import seen
 
 pytestmark = pytest.mark.serial
 SCENE = ["tissue.cells=[4, 8]", "motion={profile='hold'}", "effects.gravity={g=[0, -5]}", "time.steps=100",
@@ -30,7 +37,7 @@ def test_forces_gaps_and_touching_nodes_are_in_the_files(tmp_path: Path) -> None
     contact = simulate(build("paper_forward", SCENE)).contact
     assert contact is not None
     keys = result["contact"]["obstacles"]["table"]
-    assert keys["force_end"] == contact.force[-1, 0].tolist()
+    assert keys["force_end"] == ((contact.force[-2, 0] + contact.force[-1, 0]) / 2).tolist()
     assert keys["nodes_max"] == contact.touching.max() > 0
     header, *rows = (tmp_path / "trajectory.csv").read_text().splitlines()
     names = header.split(",")
@@ -93,3 +100,68 @@ def test_a_run_begins_with_the_warning_of_a_small_obstacle(tmp_path: Path) -> No
     assert sum("Obstacle 'pin' is 0.1 m in radius" in text for text in result["warnings"]) == 1
     text = console.export_text()
     assert 0 < text.index("Obstacle 'pin' is 0.1 m") < text.index("energy")
+
+
+def test_field_files_hold_the_traction_whose_integral_is_the_force(tmp_path: Path) -> None:
+    console = Console(quiet=True)
+    run_simulate(Path("paper_forward"), tmp_path, SCENE, console, until=50)
+    run_simulate(Path("paper_forward"), tmp_path, SCENE, console, resume=True)
+    contact = simulate(build("paper_forward", SCENE)).contact
+    assert contact is not None
+    last = meshio.read(max((tmp_path / "fields-from50").glob("*.vtu")))
+    assert not contact.impulse[-1].any()  # which the traction leaves out
+    low, traction = np.isclose(last.points[:, 1], 0.0), last.point_data["contact_traction"]
+    order = np.argsort(last.points[low, 0])
+    x, up = last.points[low, 0][order], traction[low, 1][order]
+    hats = np.full(len(x), x[1] - x[0])  # integrals of the shape functions on even edges
+    hats[[0, -1]] /= 2
+    assert hats @ up == pytest.approx(contact.force[-1, 0, 1], rel=1e-6)  # single precision
+    assert getattr(Image.open(tmp_path / "move.gif"), "n_frames", 1) > 2
+    assert (tmp_path / "contact.png").stat().st_size > 5000
+
+
+def test_pictures_show_obstacles_where_they_are() -> None:
+    path = "path={velocity=[0.3, 0.0]}"
+    disc = f"{{kind='disc', name='disc', center=[-1.0, 0.5], radius=0.2, {path}}}"
+    table = SCENE[-1].removeprefix("obstacle=[").removesuffix("]")
+    model = build("paper_forward", [*SCENE[:-1], f"obstacle=[{disc}, {table}]"])
+    picture = gather_picture(model)
+    assert picture is not None
+    times, still = np.array([0.0, 1.0]), np.zeros((2, *picture.points.shape))
+    push = np.zeros_like(still)
+    push[1, 0] = [2000.0, 0.0]  # [Pa]
+    shot = make_shot(picture, still, times, np.column_stack([times, np.zeros((2, 2))]), None, push)
+    assert shot.low[0] <= -1.2  # the picture takes the disc in
+    figure, axes = make_axes(shot, 1, captions=False)
+    draw_surroundings(axes[0], shot, [0, 1])
+    legend(figure, axes, shot)
+    lines = [c for c in axes[0].collections if not isinstance(c, Quiver)]
+    middles = [line.get_paths()[0].vertices[:-1].mean(axis=0) for line in lines]
+    assert np.allclose(middles[:2], [[-1.0, 0.5], [-0.7, 0.5]])  # after 1 s at 0.3 m/s
+    assert len(lines) == 3  # the table, which rests, once
+    assert "pressure, at most 2 kPa" in [text.get_text() for text in figure.legends[0].get_texts()]
+    (arrows,) = [c for c in axes[0].collections if isinstance(c, Quiver)]
+    assert (arrows.N, arrows.V[0]) == (1, 0.0)
+    assert arrows.U[0] > 0
+    plt.close(figure)
+
+
+def test_obstacles_in_space_are_drawn_by_the_faces_that_are_seen() -> None:
+    balls = "{kind='ball', center=[0.02, -0.1, 0], radius=0.01}, {kind='box', lo=[0, 0.1, 0], hi=[0.01, 0.11, 0.01]}"
+    down = "{kind='halfspace', normal=[0, 0, 1], offset=-0.02}"
+    coarse = ["tissue.cells=[2, 2, 2]", "tissue.order=1", "tissue.refine=false"]
+    model = build("block_3d", [*coarse, "effects.obstacles=true", f"obstacle=[{balls}, {down}]"])
+    picture = gather_picture(model)
+    assert picture is not None
+    times, still = np.zeros(1), np.zeros((1, *picture.points.shape))
+    shot = make_shot(picture, still, times, np.zeros((1, 7)), None)
+    figure, axes = make_axes(shot, 1, captions=False)
+    draw_surroundings(axes[0], shot, [0])
+    ball, box, table = axes[0].collections
+    assert (len(ball.get_paths()), len(box.get_paths()), len(table.get_paths())) == (1, 3, 1)
+    assert ball.get_zorder() > 2 > box.get_zorder()  # the body has 2; the viewer is at negative y
+    corners = table.get_paths()[0].vertices[:4]
+    body = seen(picture.points[picture.points[:, 2] == 0] - [0, 0, 0.02])  # the shadow of the body on the table
+    assert (corners.min(axis=0) < body.min(axis=0)).all()
+    assert (corners.max(axis=0) > body.max(axis=0)).all()
+    plt.close(figure)

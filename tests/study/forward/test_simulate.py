@@ -42,7 +42,7 @@ def test_three_legs_show_what_the_whole_run_shows(
     comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("softgrasp.study.pictures.body.save", rough_save)
-    monkeypatch.setattr("softgrasp.study.pictures.traces.save", rough_save)
+    monkeypatch.setattr("softgrasp.study.pictures.style.save", rough_save)
     whole, legs = mpi_tmp_path / "whole", mpi_tmp_path / "legs"
     run(whole)
     run(legs, until=15)

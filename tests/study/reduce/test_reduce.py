@@ -354,9 +354,9 @@ def test_wrong_input_is_one_sentence(
 
 
 REFUSED = {  # N asked for, with the words of its reason; the snapshots of [5, 10] cells carry less than 300 columns
-    "pod_fixed": {4: "the 4 columns of the hand count; ask for N >= 5", 300: "snapshots", 2000: "snapshots"},
-    "psd_fixed": {4: "ask for N >= 6", 13: "only even N", 300: "snapshots", 2000: "snapshots"},
-    "craig_bampton": {4: "ask for N >= 6", 13: "only even N", 300: "modes", 2000: "modes"},
+    "pod_fixed": {4: "the 4 columns of the hand count; request N >= 5", 300: "snapshots", 2000: "snapshots"},
+    "psd_fixed": {4: "request N >= 6", 13: "only even N", 300: "snapshots", 2000: "snapshots"},
+    "craig_bampton": {4: "request N >= 6", 13: "only even N", 300: "modes", 2000: "modes"},
 }
 
 
@@ -380,7 +380,7 @@ def test_more_vectors_than_few_snapshots_carry() -> None:
     swept = sweep("psd_fixed", against, wanted(against, [8, 40]))
     assert [p.N for p in swept.points] == [8]
     assert list(swept.refused) == [40]
-    assert "ask for N <=" in swept.refused[40]
+    assert "request N <=" in swept.refused[40]
 
 
 def test_a_share_that_cannot_be_kept_refuses_no_size(small: FullRun) -> None:

@@ -1,0 +1,1 @@
+"""``softgrasp export``: reduced models for other programs."""

@@ -1,0 +1,51 @@
+"""``softgrasp export``: files for a linear reduced model, one sentence for all else."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import softgrasp as sg
+from softgrasp.fem.errors import SceneError
+from softgrasp.study.cli import app
+
+SMALL = ["tissue.cells=[3, 6]", "time.steps=60", "effects.damping={kind='kelvin-voigt',beta=0.01}"]
+
+
+def export(*words: object) -> str:
+    result = CliRunner().invoke(app, ["export", *map(str, words)])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.output
+
+
+def test_a_saved_model_becomes_c(tmp_path: Path) -> None:
+    """The files of the guide, a warning where the basis keeps no structure, and no folder without a door."""
+    model = sg.build("paper_forward", SMALL)
+    run, file, folder = sg.simulate(model), tmp_path / "rom.h5", tmp_path / "plant"
+    sg.save(sg.reduce(model, run, "craig_bampton", N=10), file)
+    with pytest.raises(SceneError, match="name what to write: --c FOLDER or --fmu FILE"):
+        export(file)
+    with pytest.raises(SceneError, match=r"name it plant\.fmu"):
+        export(file, "--c", folder, "--fmu", tmp_path / "plant.zip")
+    assert not folder.exists()
+    output = export(file, "--c", folder, "--fmu", tmp_path / "plant.fmu", "--tick", 2e-3)
+    assert zipfile.is_zipfile(tmp_path / "plant.fmu")
+    assert "craig_bampton, N = 10, a tick of 0.002 s" in output
+    assert "warning" not in output
+    assert {"Makefile", "golden.log", "plant.c", "plant.h", "plant_data.h"} < {path.name for path in folder.iterdir()}
+    assert f"SG_PLANT_TICK {(2e-3).hex()}" in (folder / "plant_size.h").read_text()
+    sg.save(sg.reduce(model, run, "pod_fixed", N=8), file)
+    assert "unstable with other materials" in " ".join(export(file, "--c", folder).split())
+
+
+def test_finite_strain_is_refused(tmp_path: Path) -> None:
+    model = sg.build("paper_forward", ["tissue.cells=[2, 4]", "time.steps=20", "effects.finite_strain={}"])
+    file = tmp_path / "strain.h5"
+    sg.save(sg.reduce(model, sg.simulate(model), N=6), file)
+    with pytest.raises(SceneError, match=r"strain\.h5: only linear reduced models are exported"):
+        export(file, "--c", tmp_path / "plant")
+    assert not (tmp_path / "plant").exists()
