@@ -72,11 +72,13 @@ def tick_seconds(controller: Controller) -> float:
 
 
 def save_controllers(study: GainStudy, out: Path, target: PlantState) -> list[Path]:
-    """controller.npz for the robot, gain.npz of full order with x_bar. Collective."""
+    """controller.npz and observer.npz for the robot, gain.npz of full order with x_bar. Collective."""
     design, layout = study.design, study.design.problem.layout
     files = []
     if study.controller is not None and layout.comm.rank == 0:
         files.append(study.controller.controller.save(out / "controller.npz"))
+    if study.observed is not None and layout.comm.rank == 0:
+        files.append(study.observed.observed.controller.save(out / "observer.npz"))
     return [*files, save_gain(out / "gain.npz", design.gain, target, layout, scene_hash(design.model.scene))]
 
 

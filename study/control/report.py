@@ -14,9 +14,8 @@ from softgrasp.lqr import BasisGains, Design, GainQuality, LoopMargins, RiccatiS
 from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, gain_change, settled
 from softgrasp.study.forward.result import trajectory_header
 from softgrasp.study.pictures import speed_up
-from softgrasp.study.report import Columns, Section, Table, captioned, entry, table_of
+from softgrasp.study.report import Columns, Page, Section, Table, captioned, entry, table_of
 from softgrasp.study.report.equation import control_equation
-from softgrasp.study.shell import Page
 
 Row = tuple[Any, ...]
 LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal")
@@ -261,7 +260,9 @@ def compose(study: GainStudy, seconds: Mapping[str, float], pictures: Sequence[P
     noted = [Section("Notes", text=notes, terminal=True)] if notes else []
     result = Section("Result", rows=result_rows(study, seconds), terminal=True)
     if not isinstance(study, ControlStudy):
-        return Page(f"{name}: optimal gain", summary(study), [*noted, result], {}, files, " --gain-only")
+        return Page(
+            f"{name}: optimal gain", summary(study), [*noted, *_observed(study), result], {}, files, " --gain-only"
+        )
     parts, outcome = sections(study, noted, result, pictures), summary(study)
     if study.planned is not None:
         from softgrasp.study.control.obstacle.report import sentence
@@ -288,6 +289,7 @@ def sections(study: ControlStudy, notes: Sequence[Section], result: Section, dra
         Section("", figures=pick("move.png", "move.gif")),
         *notes,
         *planned,
+        *_observed(study),
         replace(result, figures=pick("histories.png", "decay.png")),
         Section("Equation", equation=control_equation(study.design.model.scene)),
     ]
@@ -300,6 +302,15 @@ def sections(study: ControlStudy, notes: Sequence[Section], result: Section, dra
         own = [] if i else pick("retune.png")
         parts.append(table_of(r.points, BOX, "" if i else "Re-tuning").section(text, figures=own))
     return parts
+
+
+def _observed(study: GainStudy) -> list[Section]:
+    """The observer, where there is one."""
+    if study.observed is None:
+        return []
+    from softgrasp.study.control.observer.report import observer_sections
+
+    return observer_sections(study.observed)
 
 
 def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Section]:

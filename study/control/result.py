@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,8 @@ from softgrasp.lqr.plant.problem import RiccatiSolution, rigid_gains, translatio
 from softgrasp.study.forward.result import newton_keys
 from softgrasp.study.report.origin import origin, peak_memory_mb
 
-if TYPE_CHECKING:  # plans are not imported where a scene asks for none
+if TYPE_CHECKING:  # plans and observers are not imported where a scene has none
+    from softgrasp.study.control.observer.result import ObservedStudy
     from softgrasp.study.control.obstacle.result import PlannedStudy
 
 TITLES = {
@@ -98,6 +99,7 @@ class GainStudy:
     controller: CertifiedController | None  # the small controller; None when no small gain is certified
     tick: float  # seconds of one tick of it, median
     notes: tuple[str, ...]  # what was chosen for the user, and why parts are missing
+    observed: ObservedStudy | None = field(default=None, kw_only=True)  # the observer; None where the scene has none
 
     @cached_property
     def margins(self) -> LoopMargins | None:
@@ -147,6 +149,7 @@ class GainStudy:
             "findings": self.findings,
             "damping_enough": d.diagnosis.damping_enough,
             "controller": controller,
+            **({} if self.observed is None else {"observer": self.observed.result()}),
             "notes": self.notes,
             "time": {**seconds, "solver": dict(solution.seconds)},
             "memory_peak_mb": peak_memory_mb(layout.comm),

@@ -19,7 +19,8 @@ from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, r
 from softgrasp.study.control import measure, report
 from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
 from softgrasp.study.pictures import Frames, draw_in_background
-from softgrasp.study.shell import Flags, Page, Session, folder_lock
+from softgrasp.study.report import Page
+from softgrasp.study.shell import Flags, Session, folder_lock
 
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 
@@ -59,12 +60,18 @@ def run_control(
             word = "going on from" if exists else "interrupted, the same command goes on from"
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
         feedback = design(linearised(model), watch, solver_bar(bar, model), restart)
+        observed = None
+        if control_of(model).observer is not None:  # first: what has no observer is refused at once
+            from softgrasp.study.control.observer.measure import observed_study  # no other scene needs it
+
+            observed = observed_study(feedback, watch)
         if gain_only:
             study = small_study(feedback, watch, sentence)
         else:
             study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence)
             if retune:
                 study = with_retuning(model, study, watch, bar)
+    study = replace(study, observed=observed)
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
         saved = measure.save_controllers(study, out, end_state(model, study))
