@@ -13,11 +13,11 @@ from rich.progress import MofNCompleteColumn
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.study.shell.folder import claim, folder_lock
 from softgrasp.study.shell.session import list_files, progress_bar
-from tests.hardcases import certified, estimates, faults, loops, motion, reduction, riccati, statics
+from tests.hardcases import certified, contact, estimates, faults, loops, motion, reduction, riccati, statics
 from tests.hardcases.cases import Family, FamilyResult, HardCaseResult
 from tests.hardcases.page import show, write_files
 
-MODULES: Any = (statics, estimates, motion, reduction, certified, riccati, loops, faults)
+MODULES: Any = (statics, estimates, motion, contact, reduction, certified, riccati, loops, faults)
 FAMILIES: dict[str, Family] = {family.name: family for module in MODULES for family in module.FAMILIES}
 
 
