@@ -27,15 +27,30 @@ BLOCK_ENTRIES = 131_072  # about so many of a block of columns: memory that the 
 
 @contextmanager
 def petsc_options(prefix: str, entries: dict[str, object]) -> Iterator[None]:
-    """Set prefixed options for a ``setFromOptions`` call and remove them again: the database is global."""
+    """Set prefixed options but those of the user, and remove them again: the database is global.
+
+    Options of a factor are read at its set-up, so that belongs into the block.
+    """
     database = PETSc.Options(prefix)
-    for key, value in entries.items():
+    ours = {key: value for key, value in entries.items() if not database.hasName(key)}
+    for key, value in ours.items():
         database[key] = value
     try:
         yield
     finally:
-        for key in entries:
+        for key in ours:
             database.delValue(key)
+
+
+def user_options(prefix: str = "softgrasp_") -> list[str]:
+    """Names of the PETSc options that the user gave for a prefix, without the leading dash."""
+    return [name for name in PETSc.Options().getAll() if name.startswith(prefix)]
+
+
+def from_options(solver: Any) -> None:
+    """Let the user's options for the prefix of a solver (KSP, EPS, SVD) win; nothing without any. Collective."""
+    if user_options(solver.getOptionsPrefix()):
+        solver.setFromOptions()
 
 
 def total(comm: MPI.Intracomm, local: Array) -> Array:

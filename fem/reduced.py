@@ -50,9 +50,9 @@ class MidpointSteps:
     """Midpoint steps of E w' = A w + loads [u; 1], several in one product."""
 
     dt: float  # step [s]
-    E: Array  # matrix of the rates, (n, n)
-    A: Array  # matrix of the states, (n, n)
-    loads: Array  # inputs and the constant load, (n, m + 1)
+    E: Array  # matrix of the rates, (k, k)
+    A: Array  # matrix of the states, (k, k)
+    loads: Array  # matrix of the inputs and the constant load, (k, m + 1)
 
     @property
     def size(self) -> int:
@@ -61,7 +61,7 @@ class MidpointSteps:
 
     @property
     def steps(self) -> int:
-        """Steps b in one product with ``block``."""
+        """Number of steps b in one product with ``block``."""
         return int(np.clip(BLOCK_ENTRIES // max(self.size, 1) ** 2, 1, STEPS))
 
     @cached_property
@@ -239,7 +239,7 @@ class ReducedSystem(StateSpace):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs with their units, "force_x [N]"."""
+        """Names of the inputs with their units, "force_x [N]", (n_s,)."""
         return tuple(f"{'torque' if c.rotation else 'force'}_{c.axis} [{c.load_unit}]" for c in self._hand)
 
     @property

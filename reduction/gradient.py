@@ -11,13 +11,14 @@ derivatives are exact to rounding, for the cost of about a run whatever their nu
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.reduced import MidpointSteps
 from softgrasp.fem.shown import Shown
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory, run
@@ -169,3 +170,36 @@ def _hand(system: EnergySystem, rows: slice, r: Array, costate: Array, dt: float
     by_v[1:] += dt / 2 * later[1:]
     table[0] += later[0]
     return table, by_v
+
+
+def sensitivities(
+    system: EnergySystem, others: Sequence[EnergySystem], answer: ReducedTrajectory, *, driven: bool
+) -> Array:
+    """dy/dtheta of a run for steps of each constant, (others, steps + 1, p). Online; not collective.
+
+        E s' = A s + (A_theta x + f_theta - E_theta x'),   dy/dtheta = C s
+
+    Systems are affine in each constant, so that a derivative is the difference to the system at another value of it,
+    times the step between the values. A start that is not zero is the equilibrium, which moves with the constants.
+
+    Args:
+        system: at which the run was made.
+        others: the system at another value of one constant each.
+        answer: the run.
+        driven: whether the hand was prescribed.
+    """
+    k = 2 * system.n_s
+    rows, tissue = slice(k if driven else 0, system.N), slice(k, system.N)
+    x, dt = answer.x, float(answer.times[1])
+    E, A, C = system.E[rows, rows], system.A[rows, rows], system.C[:, rows]
+    step = MidpointSteps(dt, E, A, np.hstack([np.eye(len(E)), np.zeros((len(E), 1))]))
+    middle, rate, moves = (x[1:] + x[:-1]) / 2, np.diff(x, axis=0) / dt, bool(x[0, tissue].any())
+    result = np.empty((len(others), *answer.outputs.shape))
+    for i, other in enumerate(others):
+        slope_a, slope_e, slope_f = other.A - system.A, other.E - system.E, other.f - system.f
+        start = np.zeros(system.N)
+        if moves:  # A x_0 + f = 0 in the rows of the tissue
+            start[tissue] = -np.linalg.solve(system.A[tissue, tissue], slope_a[tissue] @ x[0] + slope_f[tissue])
+        loads = middle @ slope_a[rows].T + slope_f[rows] - rate @ slope_e[rows].T
+        result[i] = step.march(loads, start[rows]) @ C.T
+    return result

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from softgrasp.reduction.archive import load as load
     from softgrasp.reduction.archive import save as save
     from softgrasp.reduction.gradient import gradient as gradient
+    from softgrasp.reduction.identify.identify import identify as identify
     from softgrasp.reduction.reduce import errors as errors
     from softgrasp.reduction.reduce import reduce as reduce
     from softgrasp.reduction.reduce import replay as replay
@@ -55,6 +56,7 @@ _FACE = {
     "replay": "reduction.reduce",
     "errors": "reduction.reduce",
     "gradient": "reduction.gradient",
+    "identify": "reduction.identify.identify",
     "save": "reduction.archive",
     "load": "reduction.archive",
     "problem": "lqr.design",

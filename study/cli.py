@@ -300,20 +300,25 @@ def export(
     c: Annotated[
         Path | None, typer.Option("--c", metavar="FOLDER", help="write C99 with its test into this folder")
     ] = None,
+    fmu: Annotated[
+        Path | None, typer.Option(help="write a file of FMI 3.0 for Simulink, Modelica and others, e.g. plant.fmu")
+    ] = None,
     tick: Annotated[float, typer.Option(help="time step of the exported model in seconds")] = 1e-3,
 ) -> None:
-    """Write a reduced model for other programs: C99 that a robot or a simulator steps.
+    """Write a reduced model for other programs: C99 for a robot, an FMU for simulators.
 
     The load on the hand goes in, hand and outputs of the scene come out; mu, lambda and beta may change at any tick.
 
     The C allocates nothing and calls no library. It brings a log of our own steps, which `make test` compares.
 
+    The FMU (FMI 3.0, co-simulation and model exchange) holds the same C and a binary for this machine.
+
     Example: softgrasp reduce paper_forward, then
-    softgrasp export out/paper_forward-reduce/models/craig_bampton.h5 --c plant; make -C plant test time
+    softgrasp export out/paper_forward-reduce/models/craig_bampton.h5 --c plant --fmu plant.fmu; make -C plant test time
     """
     from softgrasp.study.export.run import run_export
 
-    run_export(model, console(), c=c, tick=tick)
+    run_export(model, console(), c=c, fmu=fmu, tick=tick)
 
 
 @app.command(rich_help_panel=MODEL)

@@ -14,20 +14,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 import scipy.linalg
 
-from softgrasp.fem.columns import Array, OutputColumn
-from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem import Array, Model, OutputColumn, ReducedSystem, SoftgraspError, Trajectory
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.reduced import ReducedSystem
-from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.lqr.loop.full import LoopTrajectory
-from softgrasp.lqr.loop.margins import LoopMargins
-from softgrasp.reduction.model import ReducedModel
-from softgrasp.reduction.online import ReducedTrajectory
+from softgrasp.lqr import LoopMargins, LoopTrajectory
+from softgrasp.reduction import ReducedModel, ReducedTrajectory
 from softgrasp.reduction.reduce import errors, replay
 from softgrasp.study.control.plots import bode
-from softgrasp.study.pictures.animation import MOST_FRAMES, move_bytes
-from softgrasp.study.pictures.loop import histories
+from softgrasp.study.pictures import MOST_FRAMES, histories, move_bytes
 from softgrasp.study.pictures.style import CYCLE, FULL, WIDTH, length_unit, log_axis, paper_style
 from softgrasp.study.pictures.traces import traces
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import doctest
+import importlib
 import inspect
 import re
 import subprocess
@@ -15,6 +16,7 @@ from typing import Any, get_args, get_type_hints
 import pytest
 
 import softgrasp as sg
+from softgrasp._face import names_of
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.shown import Shown
 from softgrasp.lqr.loop.full import LoopTrajectory
@@ -121,3 +123,31 @@ def test_every_docstring_says_what_a_user_needs(name: str) -> None:
             "make_controller",
             "sweep",
         )  # definitions
+
+
+FACES = [
+    f"softgrasp.{name}"
+    for name in ("fem", "reduction", "lqr", *(f"study.{room}" for room in ("report", "pictures", "shell")))
+]
+
+
+@pytest.mark.parametrize("package", FACES)
+def test_a_package_gives_its_names_when_they_are_used(package: str) -> None:
+    """Each is that of its module, and none is called like a module of the package, which an import would put there."""
+    module = importlib.import_module(package)
+    names = names_of(str(module.__file__))
+    assert len(names) > 5
+    assert set(names) <= set(dir(module))
+    for name, at in names.items():
+        origin = importlib.import_module(at)
+        assert getattr(module, name) is getattr(origin, name)
+    folder = Path(str(module.__file__)).parent
+    assert not set(names) & {path.stem for path in folder.iterdir()} - {"style"}
+    with pytest.raises(AttributeError, match=r"no attribute 'Sceen'"):
+        module.Sceen  # noqa: B018
+
+
+def test_a_face_loads_only_what_is_used() -> None:
+    code = "import sys; from softgrasp.fem import Scene; print({'mpi4py.MPI', 'dolfinx'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.strip() == "set()", done.stderr

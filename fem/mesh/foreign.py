@@ -69,6 +69,7 @@ def read_foreign(path: Path, limit: float | None = None) -> meshio.Mesh:
 
 
 def _read(path: str, kind: str | None) -> meshio.Mesh:
+    """The mesh of a file by the format of that name; None: by its suffix. Raises ValueError: meshio's reason."""
     printed = io.StringIO()
     try:
         # meshio prints its complaints and may end the process; one sentence is enough.
@@ -80,7 +81,7 @@ def _read(path: str, kind: str | None) -> meshio.Mesh:
 
 
 def _leave(path: str, target: str, seconds: int) -> None:
-    """The program: write the mesh, or the reason as a text."""
+    """The program: write to ``target`` the mesh, or the reason as a text; ``seconds`` limit its processor time."""
     with contextlib.suppress(ImportError, ValueError):  # not POSIX, or a lower limit already: the clock then decides
         import resource
 

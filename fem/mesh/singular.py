@@ -33,7 +33,7 @@ class Ends:
     kind: tuple[Kind, ...]  # what the end is, n words
 
     def distance(self, x: Floats) -> Floats:
-        """Distance of points (n, d) from the nearest end [m], inf if there is none."""
+        """Distance of points (n, d) from the nearest end [m], (n,); inf if there is none."""
         nearest = np.full(len(x), np.inf)
         for end in self.at:
             a = end[0]
@@ -48,7 +48,7 @@ class Ends:
 def expected_order(ends: Ends, order: int, graded: bool, edges: bool = False) -> float:
     """Order of the outputs in n_e^(1/d): 2 p on graded meshes, min(2 p, 2 alpha) on even ones.
 
-    ``edges``: whether they do so by bisection in 3D, where small cells along an edge are many: at most 3.
+    ``edges``: whether the mesh is bisected in 3D, where small cells along an edge are many: at most 3.
     """
     full = 2.0 * order
     if graded:
@@ -152,14 +152,14 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
 
 
 def _find(ridges: Integers, rows: Integers) -> Integers:
-    """Places of sorted rows among the sorted unique ridges."""
+    """Numbers of the ridges that sorted rows are, (rows,)."""
     n = int(ridges.max(initial=0)) + 1
     code = np.array([n**k for k in reversed(range(ridges.shape[1]))], dtype=np.int64)
     return np.searchsorted(ridges @ code, rows @ code)
 
 
 def _angles(points: Floats, cells: Integers) -> tuple[Integers, Floats]:
-    """All vertices (2D) or edges (3D), and the sum of the angles of the cells there."""
+    """All vertices (2D) or edges (3D), (ridges, d - 1), and the sum of the cells' angles there [rad], (ridges,)."""
     d = points.shape[1]
     rows, values = [], []
     for corner in combinations(range(d + 1), d - 1):
@@ -177,7 +177,7 @@ def _angles(points: Floats, cells: Integers) -> tuple[Integers, Floats]:
 
 
 def _per_ridge(facets: Integers, ridges: Integers, d: int) -> Integers:
-    """How many of the facets (sorted rows) meet at each ridge."""
+    """Number of the facets (sorted rows) that meet at each ridge, (ridges,)."""
     count = np.zeros(len(ridges), dtype=np.int64)
     for corner in combinations(range(d), d - 1):
         np.add.at(count, _find(ridges, facets[:, list(corner)]), 1)
@@ -185,7 +185,7 @@ def _per_ridge(facets: Integers, ridges: Integers, d: int) -> Integers:
 
 
 def _layer_ends(points: Floats, facets: Integers, ridges: Integers, inner: Integers, boundary: Flags, d: int) -> Flags:
-    """Where interfaces of layers reach the boundary, branch, or turn."""
+    """Whether interfaces of layers reach the boundary, branch, or turn at each ridge, (ridges,)."""
     normals = np.zeros((len(ridges), d, d))  # sum of n n' of the facets at a ridge: of rank 1 where they are level
     if len(facets):
         edges = points[facets[:, 1:]] - points[facets[:, :1]]

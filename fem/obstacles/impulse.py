@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import SolverError
@@ -18,7 +17,6 @@ from softgrasp.fem.errors import SolverError
 Array = NDArray[Any]
 MOST = 500  # iterations; a few dozen are usual
 RTOL = 1e-14  # preconditioned norm of the residual against that of the momentum
-RIDGE = 1e-13  # share of the diagonal that makes equal rows share their impulse [1]
 
 
 def stop(
@@ -27,7 +25,7 @@ def stop(
     dot: Callable[[Array, Array], float],
     apply: Callable[[Array], Array],
     transpose: Callable[[Array], Array],
-    small: Array,
+    invert: Callable[[Array], Array],
     b: Array,
 ) -> tuple[Array, Array, Array]:
     """U with N u = b and least u'Mu, its momentum M u, and the impulses y of the rows, M u = N'y. Collective.
@@ -38,23 +36,21 @@ def stop(
         dot: product of two vectors over all ranks.
         apply: N u, (k,), on every rank.
         transpose: N'y.
-        small: N D^-1 N' with the diagonal D of M, (k, k).
+        invert: (N D^-1 N')^-1 r with the diagonal D of M.
         b: right-hand side, (k,).
 
     Raises SolverError: no convergence.
     """
-    block = small + RIDGE * np.diag(np.diag(small))
-    inverse = np.linalg.inv(np.linalg.cholesky(block))
 
     def project(r: Array) -> tuple[Array, Array, Array]:
         """Projected gradient, what it leaves of r, and the y that it takes from r."""
-        y = inverse.T @ (inverse @ apply(r / diagonal))
+        y = invert(apply(r / diagonal))
         r = r - transpose(y)
-        again = inverse.T @ (inverse @ apply(r / diagonal))
+        again = invert(apply(r / diagonal))
         return (r - transpose(again)) / diagonal, r, y
 
-    u = transpose(inverse.T @ (inverse @ b)) / diagonal
-    u += transpose(inverse.T @ (inverse @ (b - apply(u)))) / diagonal
+    u = transpose(invert(b)) / diagonal
+    u += transpose(invert(b - apply(u))) / diagonal
     momentum = multiply(u)
     # r goes on without what the projection takes from it: else its rounding grows as fast as r falls [GHN01]
     g, r, y = project(momentum)

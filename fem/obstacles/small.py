@@ -1,26 +1,22 @@
 """The contact problem of a step: 0 <= x, W x + q >= 0, x'(W x + q) = 0 with W = N S^-1 N' symmetric.
 
 Block principal pivoting [JP94] from the last set: rows of a wrong sign change sides all at once, and one by one where
-that stops to help. `small.c` keeps the factor of the set; without a compiler NumPy takes the same rounds.
+that stops to help. `contact.c` keeps the factor of the set; without a compiler NumPy takes the same rounds.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.strain.compiled import library
+from softgrasp.fem.obstacles.compiled import contact_library
 
 Array = NDArray[Any]
-SOURCE = Path(__file__).with_name("small.c")
-DECLARATION = """int softgrasp_complement(int p, int ld, const double *W, const double *q, double tol, int most,
-  int *count, int *order, double *L, double *x, int *side, double *room, long *tally);"""
-RIDGE = 1e-13  # share of the diagonal that makes equal rows share their force [1]; in `small.c` too
-RETRIES = 3  # rounds without progress before rows change sides one by one; in `small.c` too
+RIDGE = 1e-13  # share of the diagonal that makes equal rows share their force [1]; in `contact.c` too
+RETRIES = 3  # rounds without progress before rows change sides one by one; in `contact.c` too
 MOST = 40  # rounds for each row, at most: few problems take ten in all
 
 
@@ -36,7 +32,7 @@ class SmallProblem:
 
     def __init__(self, engine: str = "") -> None:
         """``engine``: "C" or "NumPy"; empty takes C where there is a compiler. Raises SolverError: there is none."""
-        code = None if engine == "NumPy" else library(SOURCE, DECLARATION, "contact is solved in NumPy, more slowly")
+        code = None if engine == "NumPy" else contact_library()
         if engine == "C" and code is None:
             raise SolverError("compiled contact is not available here; leave the engine out")
         self.code = code
@@ -53,28 +49,34 @@ class SmallProblem:
         """Rows of the set, in the order of its factor."""
         return self.order[: self.count[0]]
 
-    def _fit(self, size: int) -> None:
+    def fit(self, size: int) -> None:
         """Room for W of this size; the set stays."""
         L, order, have = np.zeros((size, size)), np.zeros(size, np.intc), int(self.count[0])
         L[:have, :have], order[:have] = self.L[:have, :have], self.order[:have]
         self.L, self.order = L, order
         self.x, self.side, self.room = np.zeros(size), np.zeros(size, np.intc), np.zeros(5 * size)
+        if self.code is not None:  # asking for a pointer takes as long as a small problem
+            at = self.code[0].from_buffer
+            self.kept = (
+                at("int[]", self.count), at("int[]", self.order), at("double[]", self.L), at("double[]", self.x),
+                at("int[]", self.side), at("double[]", self.room), at("long[]", self.tally),
+            )  # fmt: skip
 
     def restart(self, W: Array, active: Array) -> None:
         """Begin from a set of another W, whose factor is made anew."""
         self.count[0] = 0
-        self._fit(len(W))
+        self.fit(len(W))
         rows = np.sort(active)
         block = W[np.ix_(rows, rows)]
         block[np.diag_indices(len(rows))] *= 1 + RIDGE
         self.L[: len(rows), : len(rows)] = np.linalg.cholesky(block)
         self.order[: len(rows)], self.count[0] = rows, len(rows)
 
-    def resume(self, order: Array, L: Array, tally: Array, size: int) -> None:
-        """Continue with a set and its factor, (m,) and (m, m), and the counts of the rounds."""
+    def resume(self, order: Array, L: Array, size: int) -> None:
+        """Continue with a set and its factor, (m,) and (m, m)."""
         m = len(order)
-        self._fit(max(size, m))
-        self.order[:m], self.L[:m, :m], self.count[0], self.tally[:] = order, L.reshape(m, m), m, tally
+        self.fit(max(size, m))
+        self.order[:m], self.L[:m, :m], self.count[0] = order, L.reshape(m, m), m
 
     def solve(self, p: int, W: Array, q: Array, tol: float) -> Array:
         """X (p,) of the first p rows; W is contiguous and may have room for more.
@@ -83,7 +85,7 @@ class SmallProblem:
         obstacles leave no room.
         """
         if len(W) != len(self.L):
-            self._fit(len(W))
+            self.fit(len(W))
         failed = self._in_numpy(p, W, q, tol) if self.code is None else self._in_c(p, W, q, tol)
         if failed:
             raise SolverError(
@@ -94,15 +96,10 @@ class SmallProblem:
 
     def _in_c(self, p: int, W: Array, q: Array, tol: float) -> int:
         assert self.code is not None
-        ffi, c = self.code
-
-        def at(x: Array, kind: str = "double[]") -> Any:
-            return ffi.from_buffer(kind, x)
-
-        result: int = c.softgrasp_complement(
-            p, len(W), at(W), at(q), tol, MOST * p, at(self.count, "int[]"), at(self.order, "int[]"), at(self.L),
-            at(self.x), at(self.side, "int[]"), at(self.room), at(self.tally, "long[]"),
-        )  # fmt: skip
+        at = self.code[0].from_buffer
+        result: int = self.code[1].softgrasp_complement(
+            p, len(W), at("double[]", W), at("double[]", q), tol, MOST * p, *self.kept
+        )
         return result
 
     def _in_numpy(self, p: int, W: Array, q: Array, tol: float) -> int:

@@ -55,6 +55,14 @@ class Rows:
     x: Array  # force [N], (k,)
 
 
+def unsettled(reached: float) -> SolverError:
+    """The error of a step whose rounds leave a gap [m]."""
+    return SolverError(
+        f"contact: {MOST} rounds leave a gap of {reached:.2g} m at pressed nodes; take more time.steps, or an "
+        "obstacle that is large against the cells"
+    )
+
+
 class Contact:
     """Contact of one run. Making one is collective; its calls in a step as well where the tissue is distributed.
 
@@ -72,7 +80,6 @@ class Contact:
         self.system, self.midpoint, self.layout, self.hand = system, midpoint, system.layout, hand
         self.dt, self.s = midpoint.dt, midpoint.s
         self.obstacles = make_obstacles(model.scene, self.layout.dimension)
-        self.flat = all(isinstance(o.shape, HalfSpace) for o in self.obstacles)
         self.surface = make_surface(model.space, system)
         self.p, self.d = self.surface.X.shape
         self.table = Tables.empty(steps, len(self.obstacles), self.d, self.layout.n_s)
@@ -86,9 +93,6 @@ class Contact:
         self.small = SmallProblem()
         self.z, self.moved, self.forces = (np.zeros(self.p * self.d) for _ in range(3))
         self.gaps = self.after = np.zeros((len(self.obstacles), self.p))
-        # rows of W where all obstacles are flat, their responses, and whether a pair of obstacle and node has a row
-        self.pairs, self.columns, self.W = np.zeros((0, 2), dtype=int), list[int](), np.zeros((0, 0))
-        self.entered = np.zeros_like(self.gaps, dtype=bool)
         self.fastest = 0.0  # largest velocity of a boundary node in a step with contact [m/s]
         self.drive: TableDrive | ForceDrive | None = None
         self.n = 0  # number of the step in work
@@ -180,7 +184,7 @@ class Contact:
         x1, active = free, known & False
         active[self.rows.obstacle, self.rows.node] = True
         for _ in range(MOST):
-            f, rows = self._flat_forces(known, tol) if self.flat else self._forces(known, active, n, x0, free, x1, tol)
+            f, rows = self._forces(known, active, n, x0, free, x1, tol)
             x1 = free + self._correction(f)
             after = self._gaps(x1, n + 1)
             new = (after < -tol) & ~known
@@ -192,10 +196,7 @@ class Contact:
             known |= new
             active[:] = False
             active[rows.obstacle[pressed], rows.node[pressed]] = True
-        raise SolverError(
-            f"contact: {MOST} rounds leave a gap of {reached:.2g} m at pressed nodes; take more time.steps, or an "
-            "obstacle that is large against the cells"
-        )
+        raise unsettled(float(reached))
 
     def _correction(self, f: Array) -> Array:
         """Motion of the boundary nodes over the step by forces f, (p, d) [m]."""
@@ -205,35 +206,6 @@ class Contact:
             a = self.hand.inverse @ (self.responses.B[:k].T @ f)
             z += self.surface.T @ (2 / self.s**2 * a) - 2 * self.hand.kappa * (self.Y @ a)
         return z.reshape(self.p, self.d)
-
-    def _flat_forces(self, known: Flags, tol: float) -> tuple[Array, Rows]:
-        """Forces where all normals stay: W keeps the rows that it ever had, and the set its factor. Collective."""
-        self._enter(np.argwhere(known & ~self.entered))
-        k = len(self.columns)
-        rows = self._make_rows(self.pairs)
-        normals = [o.shape.normal for o in self.obstacles if isinstance(o.shape, HalfSpace)]
-        rows.normal = np.array(normals)[rows.obstacle]
-        rows.x = self.small.solve(k, self.W, self.after[rows.obstacle, rows.node] / 2, tol / 4).copy()
-        f = np.zeros(self.responses.count)
-        np.add.at(f, self.columns, rows.x)
-        return f, rows
-
-    def _enter(self, pairs: Ints) -> None:
-        """Give pairs of flat obstacle and node, (k, 2), their rows in W. Collective."""
-        have = len(self.columns)
-        self.entered[pairs[:, 0], pairs[:, 1]] = True
-        self.pairs = np.vstack([self.pairs, pairs])
-        keys = [(int(i), self.numbers[o][0]) for o, i in pairs]
-        self.responses.enter(keys)
-        self.columns += [self.responses.where[key] for key in keys]
-        k = len(self.columns)
-        if k > len(self.W):
-            W = np.zeros((max(16, 2 * k),) * 2)
-            W[:have, :have] = self.W[:have, :have]
-            self.W = W
-        if k > have:
-            G = self.responses.G[np.ix_(self.columns, self.columns[have:])]
-            self.W[:k, have:k], self.W[have:k, :k] = G, G.T
 
     def _forces(
         self, known: Flags, active: Flags, n: int, x0: Array, free: Array, x1: Array, tol: float
@@ -265,27 +237,37 @@ class Contact:
 
     def _add(self, n: int, f: Array, drive: TableDrive | ForceDrive) -> None:
         """Take forces f into the step of tissue and hand. Collective."""
-        midpoint, k = self.midpoint, len(f)
+        midpoint = self.midpoint
         w, r = midpoint.w.array_w, midpoint.r.array_w  # PETSc sees that they change
-        w += self.responses.columns[:, :k] @ f
+        w += self.responses.columns[:, : len(f)] @ f
         self.forces = self.responses.forces(f)
         r[self.places] += self.forces[self.order]
-        if self.hand is not None:
-            a = self.hand.inverse @ (self.responses.B[:k].T @ f)
-            c = self.hand.kappa * a
-            w -= midpoint.Y @ c
-            r -= midpoint.G @ c
-            drive.c[n] -= c
-            midpoint.c = drive.c[n]
-            drive.v[n + 1] += self.dt * a
-            drive.q[n + 1] += self.dt**2 / 2 * a
+        self._push_hand(n, f, drive)
         self.moved = self._take(midpoint.w_array)
+
+    def _push_hand(self, n: int, f: Array, drive: TableDrive | ForceDrive) -> None:
+        """Let a two-way hand feel forces f that the step has taken in."""
+        if self.hand is None:
+            return
+        midpoint = self.midpoint
+        a = self.hand.inverse @ (self.responses.B[: len(f)].T @ f)
+        c = self.hand.kappa * a
+        w, r = midpoint.w.array_w, midpoint.r.array_w
+        w -= midpoint.Y @ c
+        r -= midpoint.G @ c
+        drive.c[n] -= c
+        midpoint.c = drive.c[n]
+        drive.v[n + 1] += self.dt * a
+        drive.q[n + 1] += self.dt**2 / 2 * a
 
     def finish(self, state: TissueState) -> None:
         """Carry on what the step has left in the midpoint, and stop what is pressed. Collective."""
         n = self.n
         self.z += 2 * self.moved
         self.gaps = self.after
+        if len(self.rows.node):
+            assert self.drive is not None
+            self.gaps = self._gaps(self.surface.places(self.drive.q[n + 1], self.z), n + 1)  # the bits of a restart
         self.table.gap[n + 1] = self.gaps.min(axis=1)
         if len(self.rows.node):
             self.midpoint.r.array_w[self.places] += self.forces[self.order]  # which r lacks once more, as it lacks G c
@@ -304,15 +286,18 @@ class Contact:
             v[mine] -= obstacle.rate(n * self.dt)
         self.fastest = max(self.fastest, float(np.abs(v).max()))
         b = -np.einsum("ij,ij->i", normal, v)
-        if np.abs(b).max() <= STILL * self.fastest:
-            return
+        if np.abs(b).max() > STILL * self.fastest:
+            self._strike(state, n, rows, normal, b)
+
+    def _strike(self, state: TissueState, n: int, rows: Rows, normal: Array, b: Array) -> None:
+        """Change the velocity of pressed nodes along normals (k, d) by b (k,) at the end of step n. Collective."""
         free = self.hand is not None
         u, momentum, y = stopping_impulse(self.system, self.surface, rows.node, normal, b, free, self.room)
         self._kick(state, n, u, momentum)
         table, impulse = self.table, y[:, None] * normal
         np.add.at(table.impulse[n - 1], rows.obstacle, impulse)
         table.force[n - 1] += table.impulse[n - 1] / self.dt
-        forces = np.zeros((self.p, d))
+        forces = np.zeros((self.p, self.d))
         np.add.at(forces, rows.node, impulse)
         table.hand[n - 1] += self.surface.T.T @ forces.ravel() / self.dt
 
@@ -367,25 +352,29 @@ class Contact:
 
     def restart_arrays(self) -> dict[str, Array]:
         """Record and sets of a restart file, see :class:`softgrasp.fem.run.checkpoint.RestartState`."""
-        small, m = self.small, len(self.small.active)
         keys = self.responses.keys[: self.responses.count]
         parts: list[NDArray[Any]] = [
-            self.table.energy, np.array([self.fastest]), small.tally, keys.ravel(), self.pairs.ravel(),
-            np.array([self.rows.obstacle, self.rows.node]).ravel(), small.active,
-            small.L[:m, :m].ravel(),
+            self.table.energy, np.array([self.fastest]), self.small.tally, keys.ravel(), *self._sets()
         ]  # fmt: skip
-        sizes = np.array([len(part) for part in parts])
+        sizes = np.array([len(parts), *(len(part) for part in parts)])
         return {"solver_rows": self.table.packed(self.n + 1), "solver_numbers": np.concatenate([sizes, *parts])}
+
+    def _sets(self) -> list[NDArray[Any]]:
+        """What a run continues with, in flat arrays."""
+        return [np.array([self.rows.obstacle, self.rows.node]).ravel()]
 
     def restore(self, rows: Array, numbers: Array) -> None:
         """Continue with what `restart_arrays` returned. Collective."""
         self.table.unpack(rows)
-        parts = np.split(numbers[8:], np.cumsum(numbers[:7].astype(int)))
-        self.table.energy[:], self.fastest = parts[0], float(parts[1][0])
-        self.responses.enter([(int(i), int(k)) for i, k in parts[3].reshape(-1, 2)])
-        self._enter(parts[4].reshape(-1, 2).astype(int))
-        self.rows = self._make_rows(parts[5].reshape(2, -1).T.astype(int))
-        self.small.resume(parts[6].astype(int), parts[7], parts[2].astype(int), len(self.W))
+        count = 1 + int(numbers[0])
+        energy, fastest, tally, keys, *sets = np.split(numbers[count:], np.cumsum(numbers[1:count].astype(int)))[:-1]
+        self.table.energy[:], self.fastest, self.small.tally[:] = energy, float(fastest[0]), tally
+        self.responses.enter([(int(i), int(k)) for i, k in keys.reshape(-1, 2)])
+        self._resume(sets)
+
+    def _resume(self, sets: list[Array]) -> None:
+        """Take back what `_sets` returned. Collective."""
+        self.rows = self._make_rows(sets[0].reshape(2, -1).T.astype(int))
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""

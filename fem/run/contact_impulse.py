@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_matrix
 
 from softgrasp.fem.model.surface import Surface
 from softgrasp.fem.obstacles.impulse import stop
 from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.system import BlockSystem
+
+RIDGE = 1e-13  # share of the diagonal that makes equal rows share their impulse [1]
 
 
 def stopping_impulse(
@@ -51,5 +56,14 @@ def stopping_impulse(
     def dot(a: Array, b: Array) -> float:
         return float(total(comm, np.array([a[:n] @ b[:n]]))[0] + a[n:] @ b[n:])
 
-    small = (N.multiply(1 / surface.gather(diagonal)) @ N.T).toarray() + N_s / diagonal[n:] @ N_s.T
-    return stop(multiply, diagonal, dot, lambda u: N @ surface.gather(u) + N_s @ u[n:], transpose, small, b)
+    invert = _inverse((N.multiply(1 / surface.gather(diagonal)) @ N.T).tocsr(), N_s / diagonal[n:] @ N_s.T)
+    return stop(multiply, diagonal, dot, lambda u: N @ surface.gather(u) + N_s @ u[n:], transpose, invert, b)
+
+
+def _inverse(small: csr_matrix, hand: Array) -> Callable[[Array], Array]:
+    """R -> (small + hand)^-1 r; small is diagonal where no node has two rows."""
+    diagonal = small.diagonal()
+    if small.nnz == len(diagonal) and not hand.any():
+        return lambda r: r / diagonal
+    factor = cho_factor(small.toarray() + hand + RIDGE * np.diag(diagonal), lower=True, overwrite_a=True)
+    return lambda r: np.asarray(cho_solve(factor, r, check_finite=False))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from softgrasp.fem.model.build import Model
+from softgrasp.fem.obstacles.compiled import contact_library
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.contact import Contact
+from softgrasp.fem.run.contact_flat import FlatContact
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive
 
@@ -62,7 +64,9 @@ def make_contact(
     """
     assert isinstance(midpoint, ContactMidpoint)
     hand = drive.step if isinstance(drive, ForceDrive) and model.system.two_way else None
-    midpoint.contact = Contact(model, midpoint, steps, hand)
+    shapes = {entry.kind for entry in model.scene.obstacle or []}
+    kind: type[Contact] = FlatContact if shapes == {"halfspace"} and contact_library() is not None else Contact
+    midpoint.contact = kind(model, midpoint, steps, hand)
     if isinstance(drive, TableDrive):
         midpoint.contact.check_hand(drive, 0, steps + 1)
     return ContactDrive(drive, midpoint.contact), midpoint.contact

@@ -23,7 +23,6 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, combine, driven_by_root, total
 from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState, viscosity
-from softgrasp.fem.solve.solvers import ITERATIVE
 from softgrasp.fem.strain.body import HyperelasticBody
 from softgrasp.fem.strain.newton import Counts, NewtonFigures, Pairs, QuasiNewton, Root
 from softgrasp.fem.strain.points import whole_points
@@ -88,10 +87,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     def _refactor_cost(self) -> float:
         """Iterations of the same time as a tangent and its factor [1]: entries of the factor over 4 n_e."""
-        if self.solver.name in ITERATIVE:
-            return 8.0
-        nz = self.solver.ksp.getPC().getFactorMatrix().getInfo()["nz_used"]
-        return float(np.clip(nz / (4 * self.system.layout.n_e), 8, 100))
+        return float(np.clip((self.solver.entries or 0.0) / (4 * self.system.layout.n_e), 8, 100))
 
     def _dots(self, A: Array, x: Array) -> Array:
         products = A @ x

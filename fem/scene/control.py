@@ -210,6 +210,64 @@ class Constraints(Section):
         return self
 
 
+class SampleNoise(Section):
+    """Standard deviations of the samples of an observer."""
+
+    pose: Positive = Field(1e-5, description="of the displacement of the hand [m, rad]")
+    marker: Positive = Field(1e-3, description="of the displacement of a marker [m]")
+    speed: Positive | None = Field(
+        None, description="of the velocity of the hand [m/s, rad/s]; where it is left out the velocity is no sample"
+    )
+    force: Positive | None = Field(
+        None,
+        description="of the force that the tissue puts on the hand [N, N m]; where it is left out there is no such "
+        "sensor",
+    )
+
+
+class Disturbances(Section):
+    """White noise that acts on hand and tissue between the samples."""
+
+    hand: Positive = Field(0.02, description="acceleration along every freedom of the hand [m/s2, rad/s2 per sqrt(Hz)]")
+    load: NonNegative = Field(0.05, description="load on the tissue along every axis [N per sqrt(Hz)]")
+    box: Box | None = Field(
+        None, description="[[lo], [hi]] [m]; the load is spread over the free nodes inside, over all without it"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Disturbances:
+        check_box(self.box, "box")
+        return self
+
+
+class Observer(Section):
+    """Kalman filter of hand and tissue, from samples of every tick of the loop."""
+
+    markers: list[list[float]] = Field(
+        default_factory=list, description="points of the tissue whose displacement is measured, nearest free nodes [m]"
+    )
+    noise: SampleNoise = Field(
+        default_factory=SampleNoise,
+        description="standard deviations of the samples {pose, marker, speed, force} [m, N]",
+    )
+    disturbance: Disturbances = Field(
+        default_factory=Disturbances,
+        description="what moves hand and tissue besides the loads {hand, load, box} [m/s2, N per sqrt(Hz)]",
+    )
+    N: Annotated[int, Field(ge=8)] = Field(
+        14, description="states of the filter that runs, those of the hand included [1], even"
+    )
+    delay: Annotated[int, Field(ge=0, le=20)] = Field(0, description="ticks that all samples come late [1]")
+
+    @model_validator(mode="after")
+    def _check(self) -> Observer:
+        if self.N % 2:
+            raise ValueError(f"N is {self.N}; displacements and velocities come in pairs, give an even number")
+        if not self.markers and self.noise.force is None:
+            raise ValueError("markers or noise.force is missing; an observer needs a sample of the tissue")
+        return self
+
+
 class Control(Section):
     """Quadratic cost: integral of y' Q y + u' R u."""
 
@@ -232,6 +290,9 @@ class Control(Section):
     loop: Loop = Field(default_factory=Loop, description="how the feedback runs [various]")
     constraints: Dropped[Constraints] = Field(
         None, description="plan past obstacles and within limits [various]; off unless given"
+    )
+    observer: Dropped[Observer] = Field(
+        None, description="Kalman filter of the tissue from markers and forces [various]; off unless given"
     )
 
     @model_validator(mode="after")

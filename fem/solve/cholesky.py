@@ -17,7 +17,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import PETSc, rows_on_all, to_scipy
+from softgrasp.fem.petsc import PETSc, from_options, rows_on_all, to_scipy, user_options
 
 
 @dataclass(frozen=True)
@@ -101,14 +101,16 @@ def factor_blocks(P: PETSc.Mat, prefix: str, entries: Literal["petsc", "mumps"] 
 
     Args:
         P: the matrix in blocks of d x d (BAIJ), on this rank alone.
-        entries: who factors single entries where blocks are not stable.
+        entries: who factors single entries where blocks are not stable, or where the user gave options for the prefix,
+            which PETSc serves for single entries only.
 
     Raises SolverError: a pivot vanishes, or PETSc gives up.
     """
-    ksp = make_ksp(P.convert("sbaij", PETSc.Mat()), prefix)
-    if _factored(ksp) and (P.getBlockSize() == 1 or backward_error(P, ksp) <= BACKWARD_ERROR):
-        return ksp
-    ksp.destroy()
+    if not user_options(prefix):
+        ksp = make_ksp(P.convert("sbaij", PETSc.Mat()), prefix)
+        if _factored(ksp) and (P.getBlockSize() == 1 or backward_error(P, ksp) <= BACKWARD_ERROR):
+            return ksp
+        ksp.destroy()
     single = P.convert("aij", PETSc.Mat())
     single.setOption(PETSc.Mat.Option.SPD, True)
     ksp = make_ksp(single, prefix, entries)
@@ -167,7 +169,50 @@ def make_ksp(P: PETSc.Mat, prefix: str, by: Literal["petsc", "mumps"] = "petsc")
         pc.setFactorSolverType("mumps")
     else:
         pc.setFactorOrdering("natural")
+    from_options(ksp)
     return ksp
+
+
+def solve_checked(ksp: PETSc.KSP, r: PETSc.Vec, w: PETSc.Vec, name: str) -> None:
+    """Solve S w = r. Collective. Raises SolverError: the iteration does not converge."""
+    ksp.solve(r, w)
+    if ksp.getConvergedReason() < 0:
+        advice = "choose time.solver = 'mumps' or a larger time.rtol"
+        if user_options(prefix := ksp.getOptionsPrefix()):
+            advice = f"change the PETSc options -{prefix}*, such as a larger ksp_max_it or ksp_rtol"
+        raise SolverError(
+            f"{name}: no convergence after {ksp.getIterationNumber()} iterations "
+            f"(PETSc reason {ksp.getConvergedReason()}); {advice}"
+        )
+
+
+class AskedSolver:
+    """A solver that the user's options may have made an iteration, in the place of a factor.
+
+    Args:
+        ksp: the solver; stays with its owner.
+    """
+
+    def __init__(self, ksp: PETSc.KSP) -> None:
+        self.ksp, self.createVecs = ksp, ksp.getOperators()[0].createVecs
+
+    def solve(self, r: PETSc.Vec, w: PETSc.Vec) -> None:
+        """Solve S w = r. Collective where the solver is. Raises SolverError: the iteration does not converge."""
+        solve_checked(self.ksp, r, w, self.ksp.getPC().getType())
+
+    def matSolve(self, B: PETSc.Mat, X: PETSc.Mat) -> None:  # noqa: N802  (PETSc's name, as a factor has it)
+        """Solve S X = B for dense columns. Collective. Raises SolverError: the iteration does not converge."""
+        self.ksp.matSolve(B, X)
+        if self.ksp.getConvergedReason() < 0:
+            raise SolverError(
+                f"{self.ksp.getPC().getType()}: no convergence for {B.getSize()[1]} columns; change the PETSc options "
+                f"-{self.ksp.getOptionsPrefix()}*, such as a larger ksp_max_it or ksp_rtol"
+            )
+
+
+def direct_solves(ksp: PETSc.KSP) -> PETSc.Mat | AskedSolver:
+    """The factor of a solver, whose own solves skip its checks; the solver itself where the user gave options."""
+    return AskedSolver(ksp) if user_options(ksp.getOptionsPrefix()) else ksp.getPC().getFactorMatrix()
 
 
 def _factored(ksp: PETSc.KSP) -> bool:
@@ -190,12 +235,12 @@ class OrderedFactor:
     One gather a solve; every rank solves for all rows and keeps its own.
 
     Args:
-        factor: of the permuted matrix; stays with its solver.
+        factor: of the permuted matrix (:func:`direct_solves`); stays with its solver.
         order: of its rows.
         like: a vector with the distribution of those to come.
     """
 
-    def __init__(self, factor: PETSc.Mat, order: NodeOrder, like: PETSc.Vec) -> None:
+    def __init__(self, factor: PETSc.Mat | AskedSolver, order: NodeOrder, like: PETSc.Vec) -> None:
         self.factor, self.order = factor, order
         self.comm = like.comm.tompi4py()
         first, last = like.owner_range

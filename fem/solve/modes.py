@@ -7,7 +7,7 @@ from mpi4py import MPI
 from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, PETSc
+from softgrasp.fem.petsc import Array, PETSc, from_options
 from softgrasp.fem.solve.solvers import ITERATIVE, TissueSolver, choose_solver
 from softgrasp.fem.solve.stiffness import factored_stiffness
 from softgrasp.fem.system import BlockSystem
@@ -109,6 +109,7 @@ def _make_eps(system: BlockSystem, solver: TissueSolver) -> SLEPc.EPS:
     pc = ksp.getPC()
     pc.setType("python")
     pc.setPythonContext(_Factored(solver))
+    from_options(eps)
     return eps
 
 

@@ -9,14 +9,17 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, PETSc, petsc_options, total, whole_copy
+from softgrasp.fem.petsc import Array, PETSc, from_options, petsc_options, total, user_options, whole_copy
 from softgrasp.fem.solve.cholesky import (
     VANISHING_PIVOT,
+    AskedSolver,
     NodeOrder,
     OrderedFactor,
+    direct_solves,
     dissect,
     factor_blocks,
     make_ksp,
+    solve_checked,
 )
 from softgrasp.fem.solve.costs import FEW_SOLVES, Work
 from softgrasp.fem.solve.costs import ITERATIVE as ITERATIVE
@@ -36,6 +39,7 @@ OUT_OF_MEMORY = 3  # PC_FACTOR_OUTMEMORY
 # busy machine failed, for a cause that was not found; pages that are not touched need no memory.
 WORKSPACE = 100
 PACKAGES = {"petsc": "PETSc", "mumps": "MUMPS"}  # PETSc's names of those that factor
+FACTORS = ("cholesky", "lu")  # PETSc's names of direct preconditioners
 
 
 class SolverUsed(NamedTuple):
@@ -76,6 +80,12 @@ def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: 
     return work_of(layout, 1, False, 1.0, reproducible).repeated(solver)
 
 
+def package_of(pc: PETSc.PC) -> str:
+    """Package that factors, or the preconditioner where none does, as PETSc reports it."""
+    by = pc.getFactorSolverType() if pc.getType() in FACTORS else pc.getType().upper()
+    return PACKAGES.get(by, str(by))
+
+
 @dataclass(frozen=True)
 class TissueSolver:
     """A factored (or preconditioned) symmetric positive definite matrix of the tissue block."""
@@ -86,20 +96,27 @@ class TissueSolver:
     tolerance: float  # largest relative residual that ``check`` accepts [1]
     # factor that solves without ``ksp``: whole on every rank, perhaps in an order of its own
     # (softgrasp.fem.solve.cholesky), or that of one rank; None where the factor is spread or there is none
-    factor: PETSc.Mat | OrderedFactor | None = None
+    factor: PETSc.Mat | AskedSolver | OrderedFactor | None = None
     stars: Stars | None = None  # preconditioner of solver "stars", which owns S; else None
 
     @property
     def package(self) -> str:
         """Package of the factor, as PETSc reports it, or of the preconditioner."""
-        pc = self.ksp.getPC()
-        if self.stars is not None:
+        if self.stars is not None and self.stars.package:
             return f"stars, {self.stars.package}"
-        return str(pc.getType().upper() if self.name == "cg" else PACKAGES[pc.getFactorSolverType()])
+        return package_of(self.ksp.getPC())
+
+    @property
+    def entries(self) -> float | None:
+        """Nonzero entries of the factor, as PETSc counts them; None where there is none. Collective."""
+        pc = self.ksp.getPC()
+        return float(pc.getFactorMatrix().getInfo()["nz_used"]) if pc.getType() in FACTORS else None
 
     def used(self, reason: str) -> SolverUsed:
-        """This solver with the reason of its choice; single entries, which make a slower step, are added to it."""
-        if self.name == "cholesky" and "sbaij" not in self.ksp.getOperators()[0].getType():
+        """This solver with the reason of its choice; to it are added the user's options, or single entries (slower)."""
+        if asked := user_options(self.ksp.getOptionsPrefix()):
+            reason += f"; with the PETSc options -{', -'.join(asked)}"
+        elif self.name == "cholesky" and "sbaij" not in self.ksp.getOperators()[0].getType():
             reason += f"; in single entries by {self.package}, since blocks would lose digits here"
         return SolverUsed(self.name, reason, self.package)
 
@@ -111,12 +128,7 @@ class TissueSolver:
         if self.factor is not None:
             self.factor.solve(r, w)
             return
-        self.ksp.solve(r, w)
-        if self.ksp.getConvergedReason() < 0:
-            raise SolverError(
-                f"{self.name}: no convergence after {self.ksp.getIterationNumber()} iterations "
-                f"(PETSc reason {self.ksp.getConvergedReason()}); choose time.solver = 'mumps' or a larger time.rtol"
-            )
+        solve_checked(self.ksp, r, w, self.name)
 
     def columns(self, X: Array, where: str = "") -> Array:
         """S^-1 X of local rows (n_local, k), Fortran order; checked as :meth:`check` does if ``where`` is given.
@@ -262,16 +274,15 @@ def make_solver(
         ksp.setType("preonly")
         ksp.getPC().setType("cholesky")
         ksp.getPC().setFactorSolverType("mumps")
-        if S.comm.size > 1:
-            ksp.getPC().setFactorSetUpSolverType()
-            ksp.getPC().getFactorMatrix().setMumpsIcntl(14, WORKSPACE)
+        from_options(ksp)
     try:
-        _factor(ksp, S, name)
+        with petsc_options(prefix, {"mat_mumps_icntl_14": WORKSPACE} if name == "mumps" and S.comm.size > 1 else {}):
+            _factor(ksp, S, name)
     except SolverError:
         ksp.destroy()
         S.destroy()
         raise
-    factor = ksp.getPC().getFactorMatrix() if name != "cg" and ksp.comm.size == 1 else None
+    factor = direct_solves(ksp) if name != "cg" and ksp.comm.size == 1 else None
     return TissueSolver(name, ksp, S, tolerance, factor)
 
 
@@ -292,7 +303,7 @@ def _repeated(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float) 
 def _gathered(ksp: PETSc.KSP, order: NodeOrder, S: PETSc.Mat) -> OrderedFactor:
     """The factor of one rank alone for vectors distributed as those of S. Collective."""
     like = S.createVecLeft()
-    factor = OrderedFactor(ksp.getPC().getFactorMatrix(), order, like)
+    factor = OrderedFactor(direct_solves(ksp), order, like)
     like.destroy()
     return factor
 
@@ -314,7 +325,7 @@ def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, 
     finally:
         if P is not S:
             P.destroy()  # the ksp owns what it needs
-    factor = ksp.getPC().getFactorMatrix() if order is None else _gathered(ksp, order, S)
+    factor = direct_solves(ksp) if order is None else _gathered(ksp, order, S)
     return TissueSolver("cholesky", ksp, S, tolerance, factor)
 
 

@@ -85,26 +85,32 @@ class Stars:
         self.matrices = fine, smoother, linear
         ksp.setOperators(fine)
         pc = ksp.getPC()
-        if pc.getType() != "mg":
+        if pc.getType() is None:
             pc.setType("mg")
             pc.setMGLevels(2)  # the levels get the prefix of this moment
             pc.setMGInterpolation(1, self.P)
-        level, coarse = pc.getMGSmoother(1), pc.getMGCoarseSolve()
-        level.setOperators(fine, smoother)
-        level.setType("chebyshev")
-        level.getPC().setType("mat")
-        level.setTolerances(max_it=DEGREE)
-        coarse.setOperators(linear, linear)
+        coarse = None
+        if pc.getType() == "mg":
+            level, coarse = pc.getMGSmoother(1), pc.getMGCoarseSolve()
+            level.setOperators(fine, smoother)
+            level.setType("chebyshev")
+            level.getPC().setType("mat")
+            level.setTolerances(max_it=DEGREE)
+            coarse.setOperators(linear, linear)
         with petsc_options(ksp.getOptionsPrefix(), SMOOTHER | (FACTORED if self.factored else ITERATED)):
             ksp.setFromOptions()
             ksp.setUp()
-            coarse.setUp()
+            if coarse is not None and pc.getType() == "mg":  # the options may have changed it
+                coarse.setUp()
 
     @property
     def package(self) -> str:
-        """Package that solves the linear elements, as PETSc reports it."""
-        pc = self.ksp.getPC().getMGCoarseSolve().getPC()
-        return str(pc.getFactorSolverType() if self.factored else pc.getType()).upper()
+        """Package that solves the linear elements, as PETSc reports it; "" where the user's options took them away."""
+        pc = self.ksp.getPC()
+        if pc.getType() != "mg":
+            return ""
+        pc = pc.getMGCoarseSolve().getPC()
+        return str(pc.getFactorSolverType() or pc.getType()).upper()
 
     def _smoother(self, S: PETSc.Mat) -> PETSc.Mat:
         """B in blocks. Collective."""

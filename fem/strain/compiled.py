@@ -23,7 +23,10 @@ FLAGS = (f"-DLANES={LANES}", "-O3", "-march=native", "-fno-math-errno", "-fno-tr
 
 @functools.cache
 def library(source: Path, declaration: str, otherwise: str) -> Any:
-    """(ffi, library) of a source, or None with a warning, what is done ``otherwise``, where it cannot be compiled."""
+    """(ffi, library) of a C source; None, with a warning, where it cannot be compiled.
+
+    ``declaration``: of its functions, for cffi; ``otherwise``: the way that is used instead, begins the warning.
+    """
     try:
         from cffi import FFI  # it comes with FFCx, not with every online machine
 

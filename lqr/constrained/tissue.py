@@ -49,17 +49,7 @@ class ModalTissue:
         n, n_s = self.g.shape
         if not n_s < k <= n:
             raise ControlError(f"a plan needs {n_s + 1} to {n} shapes of the tissue, not {k}")
-        decay = np.maximum(self.delta, np.finfo(float).tiny)
-        cost = np.sum(self.c**2, axis=0) * np.sum(self.g**2, axis=1) / (decay * self.omega**2)
-        order = np.argsort(-cost, kind="stable")
-        static = self.g / self.omega[:, None] ** 2
-        shapes = np.linalg.qr(np.eye(n)[:, order[: k - n_s]])[0]
-        for column in (static / np.linalg.norm(static, axis=0)).T:  # those that the modes leave something of
-            for _ in range(2):
-                column = column - shapes @ (shapes.T @ column)
-            size = np.linalg.norm(column)
-            if size > INDEPENDENT:
-                shapes = np.column_stack([shapes, column / size])
+        shapes = static_and_modes(self.omega, self.delta, self.g, self.c, k)
         squares, T = np.linalg.eigh(shapes.T @ (self.omega[:, None] ** 2 * shapes))
         V = shapes @ T
         return ModalTissue(np.sqrt(squares), self.alpha, self.beta, V.T @ self.g, self.seen @ V, self.c @ V)
@@ -82,6 +72,31 @@ class ModalTissue:
             result[k] = (first * slow + second * fast).real + static
             eta, rate = result[k, -1], (p * first * slow[-1] + m * second * fast[-1]).real
         return result
+
+
+def static_and_modes(omega: Array, delta: Array, g: Array, c: Array, k: int) -> Array:
+    """K^{-1} G and modes in the order |c|^2 |g|^2 / (delta omega^2): k orthonormal columns of amplitudes, (n, k).
+
+    Args:
+        omega: natural frequencies [1/s], (n,).
+        delta: decay of the modes [1/s], (n,).
+        g: coupling to the hand, (n, n_s).
+        c: outputs of the modes, (p, n).
+        k: number of columns, more than n_s.
+    """
+    n, n_s = g.shape
+    decay = np.maximum(delta, np.finfo(float).tiny)
+    cost = np.sum(c**2, axis=0) * np.sum(g**2, axis=1) / (decay * omega**2)
+    order = np.argsort(-cost, kind="stable")
+    static = g / omega[:, None] ** 2
+    shapes = np.linalg.qr(np.eye(n)[:, order[: k - n_s]])[0]
+    for column in (static / np.linalg.norm(static, axis=0)).T:  # those that the modes leave something of
+        for _ in range(2):
+            column = column - shapes @ (shapes.T @ column)
+        size = np.linalg.norm(column)
+        if size > INDEPENDENT:
+            shapes = np.column_stack([shapes, column / size])
+    return np.asarray(shapes)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import hashlib
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,12 @@ from softgrasp.fem.shown import Card, Shown, amount, counted, listed
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 
+if TYPE_CHECKING:
+    from softgrasp.lqr.loop.filter import Filter
+
 FORMAT = 1
 PLANT = ("E", "A", "B", "C", "f", "S_q", "S_v")  # arrays of the reduced plant in a file
+FILTER = ("A", "B", "f", "C", "M")  # of the observer
 
 
 def layout_hash(layout: BlockLayout) -> str:
@@ -50,13 +54,13 @@ def _sorted(layout: BlockLayout) -> tuple[NDArray[np.int64], str] | None:
 class Controller(Shown):
     """u = clip(u_bar + K (x - x_bar)) for x = [q_s, v_s, eta, eta'], with eta = W'z a few numbers of the tissue.
 
-    A robot measures its hand, not the tissue. ``step`` therefore carries eta itself, without an observer: the tissue
+    A robot measures its hand, not the tissue. Without an observer ``step`` therefore carries eta itself: the tissue
     hangs on the hand, so the measured hand motion drives the model's tissue by the midpoint rule,
 
         M eta'' + D eta' + K eta = -G (a - g) [- alpha G v],   a = (v_k - v_{k-1}) / period,
 
-    ([...] where damping drags in space), and what is wrong at the start decays with the tissue's own damping. Nothing
-    here talks to MPI or PETSc.
+    ([...] where damping drags in space), and what is wrong at the start decays with the tissue's own damping. With an
+    observer the samples y of a tick correct the whole state. Nothing here talks to MPI or PETSc.
 
     Raises:
         ControlError: a shape is wrong, the plant does not begin with the hand, or the period is not positive.
@@ -85,6 +89,8 @@ class Controller(Shown):
     """Digest of the mesh's free nodes; empty when unknown."""
     about: dict[str, Any] = field(default_factory=dict)
     """Method, weights and output names, as free text."""
+    observer: Filter | None = None
+    """Kalman filter of the reduced plant at the period; None where nothing but the hand is measured."""
 
     def card(self) -> Card:
         """Dimension, rate, limits and target."""
@@ -112,6 +118,8 @@ class Controller(Shown):
         self._offset = self.u_bar - self.K @ self.x_bar
         self._lower = np.full(n_s, -np.inf) if self.limits is None else -self.limits
         self._upper = -self._lower
+        if self.observer is not None and self.observer.B.shape != (N, n_s):
+            raise ControlError(f"the observer has {len(self.observer.A)} states, the plant of the controller {N}")
         self.model = _tissue_step(self.plant, self.period)
         self.reset()
 
@@ -121,20 +129,30 @@ class Controller(Shown):
         return int(self.plant.B.shape[1])
 
     def reset(self, tissue: Array | None = None) -> None:
-        """Forget the past; the tissue starts at [eta, eta'] or, by default, hangs still."""
+        """Start anew with the tissue at [eta, eta'], (N - 2 n_s,); by default at rest."""
         n_s = self.n_s
         self._x = np.zeros(self.plant.N)
         self._x[2 * n_s :] = self.plant.rest_at(np.zeros(n_s))[0][2 * n_s :] if tissue is None else tissue
         self._fresh = True
 
     def command(self, x: Array) -> Array:
-        """The load for a known reduced state x (N,)."""
+        """Load for a known reduced state x (N,) [N, N m], (n_s,)."""
         u = self.K @ x
         u += self._offset
         return np.minimum(np.maximum(u, self._lower), self._upper)
 
-    def step(self, q_s: Array, v_s: Array) -> Array:
-        """One tick: the load [N, N m] from the measured hand, after one step of the tissue."""
+    def step(self, q_s: Array, v_s: Array, y: Array | None = None) -> Array:
+        """Load after one tick of the tissue [N, N m], (n_s,), from the measured hand q_s [m, rad] and v_s, (n_s,).
+
+        ``y``: samples of the observer beside those of the hand [m, N], in the order of its names; an entry that is no
+        number, or None for all, is lost.
+
+        Raises ControlError: there is no observer for y, or y has another number of entries.
+        """
+        if self.observer is not None:
+            return self._observed(q_s, v_s, y)
+        if y is not None:
+            raise ControlError("this controller has no observer that takes y; leave it out, or give the scene one")
         n_s, x = self.n_s, self._x
         step, accelerated, dragged, constant = self.model
         if not self._fresh:
@@ -148,9 +166,22 @@ class Controller(Shown):
         x[:n_s], x[n_s : 2 * n_s] = q_s, v_s
         return self.command(x)
 
+    def _observed(self, q_s: Array, v_s: Array, y: Array | None) -> Array:
+        """One tick with an observer."""
+        if self._fresh:
+            from softgrasp.lqr.loop.filter import Estimate  # of controllers with an observer
+
+            assert self.observer is not None
+            self._x[: self.n_s], self._x[self.n_s : 2 * self.n_s] = q_s, v_s
+            self._estimate, self._fresh = Estimate(self.observer, self._x.copy()), False
+        self._x = self._estimate.correct(q_s, v_s, y)
+        u = self.command(self._x)
+        self._estimate.apply(u)
+        return u
+
     @property
     def tissue(self) -> Array:
-        """[eta, eta'] that the controller carries."""
+        """Current [eta, eta'] of the tissue, (N - 2 n_s,)."""
         return self._x[2 * self.n_s :].copy()
 
     def towards(self, q_bar: Array) -> Controller:
@@ -169,6 +200,9 @@ class Controller(Shown):
         arrays |= {"K": self.K, "x_bar": self.x_bar, "u_bar": self.u_bar}
         if self.limits is not None:
             arrays["limits"] = self.limits
+        if self.observer is not None:
+            arrays |= {f"observer_{key}": getattr(self.observer, key) for key in FILTER}
+            meta["observer"] = {key: getattr(self.observer, key) for key in ("names", "speed", "delay")}
         return write_npz(Path(path), meta, arrays)
 
     @classmethod
@@ -183,13 +217,25 @@ class Controller(Shown):
         try:
             plant = ReducedSystem(**{key: arrays[f"plant_{key}"] for key in PLANT}, names=tuple(meta["names"]))
             about = {key: meta[key] for key in ("period", "scene_hash", "layout_hash", "about")}
-            return cls(arrays["K"], arrays["x_bar"], arrays["u_bar"], plant, limits=arrays.get("limits"), **about)
+            about |= {"limits": arrays.get("limits"), "observer": _filter(meta, arrays)}
+            return cls(arrays["K"], arrays["x_bar"], arrays["u_bar"], plant, **about)
         except KeyError as error:
             raise ControlError(f"{path} has no controller ({error} is missing); save it again") from error
 
 
+def _filter(meta: dict[str, Any], arrays: dict[str, Array]) -> Filter | None:
+    """The observer of a file; None where it has none. Raises KeyError: an array is missing."""
+    if "observer" not in meta:
+        return None
+    from softgrasp.lqr.loop.filter import Filter
+
+    A, B, f, C, M = (arrays[f"observer_{key}"] for key in FILTER)
+    names, speed, delay = (meta["observer"][key] for key in ("names", "speed", "delay"))
+    return Filter(A, B, f, C, M, tuple(names), speed, delay)
+
+
 def _tissue_step(plant: ReducedSystem, period: float) -> tuple[Array, Array, Array | None, Array]:
-    """Midpoint rule of the tissue rows of the plant for a hand whose velocity is known.
+    """Matrices of the midpoint rule of the tissue, y = [eta, eta'], for a hand whose velocity is known.
 
     y_{k+1} = step y_k + accelerated (v_{k+1} - v_k) [+ dragged (v_{k+1} + v_k)] + constant
     """
@@ -246,7 +292,7 @@ def _named(path: Path) -> Path:
 
 
 def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Path:
-    """Write arrays and their description; a torn file never replaces a good one.
+    """Write arrays and their description; a torn file never replaces a good one. Returns the path, with .npz.
 
     Raises ControlError: the folder cannot be written.
     """
@@ -262,7 +308,7 @@ def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Pat
 
 
 def read_npz(path: Path, expected: dict[str, str | None]) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Read a file of :func:`write_npz` and check what it was made for.
+    """Description and arrays of a file of :func:`write_npz`; ``expected``: hashes that the description must have.
 
     Raises ControlError: the file is missing or damaged, or a hash differs.
     """

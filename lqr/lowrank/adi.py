@@ -26,8 +26,8 @@ class FactorColumns:
     """Growing factor Z in costate form, compressed when it gets wide.
 
     Args:
-        allowed: what a compression on the way may change in the Riccati residual.
-        limit: columns from which it is compressed.
+        allowed: change of the Riccati residual by one compression on the way, 2-norm.
+        limit: number of columns from which it is compressed.
     """
 
     def __init__(self, plant: Plant, allowed: float, limit: int = SQUEEZE) -> None:
@@ -38,7 +38,7 @@ class FactorColumns:
         self.widths: list[int] = []
 
     def append(self, block: Block) -> None:
-        """Add columns. Collective."""
+        """Append columns. Collective."""
         k = block.columns
         if self.count + k > max(self.limit, 2 * self.compressed_to):
             self.squeeze()
@@ -53,6 +53,7 @@ class FactorColumns:
         self.widths.append(k)
 
     def _grown(self, old: Array, room: int) -> Array:
+        """An array of ``room`` columns with those in use."""
         new = np.empty((len(old), room))
         new[:, : self.count] = old[:, : self.count]
         return new
@@ -103,7 +104,7 @@ class LowRankSweep:
         return self.state[: self.Z.plant.inputs]
 
     def solve(self, tissue: ShiftedTissue, queue: ShiftQueue) -> tuple[complex, AdjointSolution]:
-        """The next shift p and V of (A - B K + p E)'V = W. Collective."""
+        """Next shift p, and solution V of (A - B K + p E)'V = W. Collective."""
         begin, plant, m = time.perf_counter(), self.Z.plant, self.Z.plant.inputs
         if queue.short(self.steps):
             queue.refill(plant, self.Z.recent(), self.W.block, self.gain)
@@ -131,7 +132,7 @@ class AdiSweep(LowRankSweep):
 
     @property
     def new(self) -> AdjointRhs:
-        """(B'XE)' of the X so far."""
+        """New gain (B'XE)' of the X so far."""
         return self.gain.plus(self.change, np.eye(self.Z.plant.inputs))
 
 

@@ -13,22 +13,22 @@ from softgrasp.lqr.plant.checks import EPS, ControlError
 from softgrasp.lqr.plant.operators import damp
 from softgrasp.reduction.bases.engines import triangle
 
-COLUMNS = 64  # columns whose products are held at a time
-PROBES = 8  # sums of columns whose products estimate a norm
+COLUMNS = 64  # columns whose products are in memory at a time
+PROBES = 8  # random sums of columns from which norms are estimated
 
 
 def triangular(comm: MPI.Intracomm, X: Block) -> Array:
-    """R of the thin QR factorisation X = Q R, the same on every rank, without Q. Collective."""
+    """R of the thin QR factorisation X = Q R without Q, (k, k), the same on every rank. Collective."""
     return triangle(comm, X.tall, X.hand)
 
 
 def gram(comm: MPI.Intracomm, X: Block, Y: Block) -> Array:
-    """X'Y, the same on every rank. Collective."""
+    """X'Y of blocks of k and l columns, (k, l), the same on every rank. Collective."""
     return np.asarray(X.hand.T @ Y.hand + total(comm, X.tall.T @ Y.tall))
 
 
 def residual_weight(plant: Plant, Z: Block) -> Array:
-    """Gram matrix (A'Z)'(A'Z) / r + r (E'Z)'(E'Z), r about |A'Z| / |E'Z|, a few columns at a time. Collective.
+    """Gram matrix (A'Z)'(A'Z) / r + r (E'Z)'(E'Z), r about |A'Z| / |E'Z|, (k, k), a few columns at a time. Collective.
 
     The tissue rows leave out the hand's share of a two-way coupling, the hand's rows drag in space: this is a weight,
     no exact norm.
@@ -81,7 +81,7 @@ def _ratio(plant: Plant, Z: Block) -> float:
 
 
 def compress(plant: Plant, Z: Block, allowed: float) -> Block:
-    """Fewest columns that keep the Riccati residual within ``allowed`` (absolute, 2-norm). Collective.
+    """Factor of fewest columns whose ZZ' changes the Riccati residual by ``allowed`` at most (2-norm). Collective.
 
     A dropped column z changes the residual by at most 2 |A'z| |E'z| <= |A'z|^2 / r + r |E'z|^2 for any r > 0: the
     eigenvalues of the Gram matrix in that norm are dropped from below until their sum is reached. They enter X
@@ -92,7 +92,7 @@ def compress(plant: Plant, Z: Block, allowed: float) -> Block:
 
 
 def _leading(G: Array, allowed: float) -> Array:
-    """Columns U, fewest, whose span leaves out at most ``allowed`` of the trace of a semidefinite G; U'U = I.
+    """Fewest columns U, U'U = I, (k, r), that leave out at most ``allowed`` of the trace of a semidefinite G (k, k).
 
     A Cholesky factorisation with pivots, G = L L', first removes the range of G, of about half its order; then
     L'L = V s V' of that order and U = L V s^{-1/2}. U'U = I to rounding of G / sqrt(s_i s_j): what that adds to

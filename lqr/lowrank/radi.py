@@ -23,7 +23,7 @@ from softgrasp.lqr.plant.checks import MODAL_KEY
 
 
 def radi_columns(plant: Plant, s: complex, V: AdjointSolution) -> tuple[Block, Array, Array, float]:
-    """Real columns V_1 of the update X += V_1 Y^{-1} V_1', with Y, V_1'B and the factor of W [BBKS18].
+    """V_1, Y, V_1'B and c of X += V_1 Y^{-1} V_1', W += c E'V_1 (first q columns of Y^{-1}) [BBKS18].
 
     s real: V_1 = sqrt(-2s) V, Y = I - V_1'B B'V_1 / (2s). s complex: V_1 = sqrt(-2 Re s) [Re V, Im V] and the Y of the
     pair. Collective.

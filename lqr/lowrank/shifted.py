@@ -17,12 +17,14 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.errors import ResourceError, SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, Complex, PETSc, petsc_options, whole_copy
+from softgrasp.fem.petsc import Array, Complex, PETSc, from_options, petsc_options, whole_copy
 from softgrasp.fem.resources import free_memory
+from softgrasp.fem.solve.cholesky import direct_solves
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.plant.checks import MODAL_KEY
 
 PREFIX = "softgrasp_shifted_"
+WORKSPACE: dict[str, object] = {"mat_mumps_icntl_14": 40}  # percent beyond the estimate: pivots of an indefinite matrix
 # Every rank factors whole matrices up to here, each rank another shift: no messages in the factorisation, and SuperLU
 # in complex numbers is about as fast as MUMPS on the real form of twice the order in 2D, faster in 3D
 # (docs/benchmarks.md). Beyond, a whole factor on each rank needs too much memory.
@@ -292,9 +294,7 @@ class DistributedTissue(ShiftedTissue):
         pc = self.ksp.getPC()
         pc.setType("cholesky")  # LDL' for an indefinite matrix
         pc.setFactorSolverType("mumps")
-        # compressed ordering of 2 x 2 pivots: two to three times faster on these matrices than the default
-        with petsc_options(PREFIX, {"mat_mumps_icntl_12": 1, "mat_mumps_icntl_14": 40}):
-            self.ksp.setFromOptions()
+        from_options(self.ksp)
 
     def _values(self, A: PETSc.Mat) -> Array:
         indptr, columns, values = A.getValuesCSR()
@@ -319,7 +319,8 @@ class DistributedTissue(ShiftedTissue):
         self.S.assemble()
         self.ksp.setOperators(self.S)  # without it setUp considers the old factor valid
         try:
-            self.ksp.setUp()
+            with petsc_options(PREFIX, WORKSPACE):
+                self.ksp.setUp()
         except PETSc.Error as error:
             raise SolverError(f"MUMPS failed at the shift p = {p:.4g} (PETSc error {error.ierr})") from error
         if self.ksp.getPC().getFailedReason():
@@ -335,7 +336,7 @@ class DistributedTissue(ShiftedTissue):
         answer = np.zeros((2 * n, k), order="F")
         B, X = (PETSc.Mat().createDense(sizes, array=array, comm=self.S.comm) for array in (right, answer))
         try:
-            self.ksp.getPC().getFactorMatrix().matSolve(B, X)
+            direct_solves(self.ksp).matSolve(B, X)
         except PETSc.Error as error:
             raise SolverError(f"MUMPS failed to solve at the shift p = {p:.4g} (PETSc error {error.ierr})") from error
         finally:

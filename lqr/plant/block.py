@@ -37,7 +37,7 @@ class Block:
         return cls(np.concatenate([q_s, v_s]), np.concatenate([z, v_z]))
 
     def times(self, small: Array) -> Block:
-        """Block @ small."""
+        """Product of the columns with a matrix, (k, l)."""
         return Block(self.hand @ small, self.tall @ small)
 
     @classmethod

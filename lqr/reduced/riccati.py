@@ -37,7 +37,7 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class ReducedRiccati:
-    """P_hat = V P_N V' and its gain."""
+    """Reduced equation of a basis, its solution P_hat = V P_N V' and gain."""
 
     basis: RiccatiBasis  # basis, scaled to energy
     matrices: WeightedSystem  # E_N, A_N, B_N, C_N with the weights
@@ -95,7 +95,7 @@ class GainQuality:
 
 @dataclass(frozen=True)
 class GainReport(GainQuality):
-    """The gain of one reduced equation."""
+    """Quality of the gain of one reduced equation."""
 
     method: str  # key of the basis
     N: int  # order of the reduced equation
@@ -161,7 +161,7 @@ def gain_error(problem: RiccatiProblem, gain: Gain, gain_hat: Gain) -> float:
 
 
 def tissue_gain_error(problem: RiccatiProblem, gain: Gain, gain_hat: Gain) -> float:
-    """The same of the tissue's rows alone, beside which those of a heavy hand are large. Collective."""
+    """||K - K_hat||_F / ||K||_F of the tissue's rows alone: those of a heavy hand are large. Collective."""
     K, K_hat, none = gain.block, gain_hat.block, np.zeros((0, len(gain.K_s)))
     return norm(problem, Block(none, K.tall - K_hat.tall)) / (norm(problem, Block(none, K.tall)) or 1.0)
 
@@ -196,7 +196,7 @@ class GainCheck:
 
     @cached_property
     def _tail_modes(self) -> tuple[Array, Array] | None:
-        """What the certificates of all gains share; None where there is no bound. Collective."""
+        """Modes that the certificates of all gains share; None where there is no bound. Collective."""
         return None if why_no_bound(self.problem) else tail_modes(self.problem)
 
     def quality(self, gain: Gain) -> LoopQuality:
@@ -237,7 +237,7 @@ class GainCheck:
         return self._sampled(K, LoopQuality(spectrum.value, NAN, spectrum.certified, spectrum.exact, poles))
 
     def _of_poles(self, K: Block, loop: ModalLoop) -> LoopQuality:
-        """From the modes that a loop keeps; certain where they are all. Collective."""
+        """Quality of a gain from the modes that a loop keeps; certain where they are all. Collective."""
         poles = loop.poles(K)
         value = float(poles.real.max()) if np.isfinite(poles).all() else np.inf
         quality = LoopQuality(value, NAN, loop.complete, loop.complete, poles)
@@ -254,10 +254,11 @@ class GainCheck:
         return modal_excess(self.loop, blocks, self.K, self.start, self.law, settle) / self.optimal
 
     def _modal(self, loop: ModalLoop, K: Block) -> LoopQuality:
+        """Abscissa and excess cost of a gain on the modes that a loop keeps. Collective."""
         return loop.quality(K, self.K, self.start, self.optimal)
 
     def _sampled(self, K: Block, quality: LoopQuality) -> LoopQuality:
-        """With the radius from tick to tick; that of the law at the midpoint follows from the poles. Collective."""
+        """The quality with the radius from tick to tick; for the law at the midpoint by the poles. Collective."""
         if self.law is None:
             return quality
         if self.law.every:
@@ -266,7 +267,7 @@ class GainCheck:
         return replace(quality, sampled=radius)
 
     def report(self, basis: RiccatiBasis) -> GainReport:
-        """All figures of one basis. Collective.
+        """Errors, poles and cost of the gain of one basis. Collective.
 
         A reduced equation without solution is reported, not raised; a gain whose spectrum does not converge is not
         certified.
@@ -285,17 +286,17 @@ class GainCheck:
             reduced = reduce_riccati(self.problem, basis)
         except ControlError as error:
             return GainReport(basis.name, basis.N, reason=str(error))
-        off = factor_error(self.problem, self.Z_absolute, reduced.basis, reduced.P_N) if error_P else NAN
+        distance = factor_error(self.problem, self.Z_absolute, reduced.basis, reduced.P_N) if error_P else NAN
         error_K, gain = gain_error(self.problem, self.solution.gain, reduced.gain), reduced.gain  # noqa: N806
         known = self._of_poles(gain.block, self.loop)
         return GainReport(
-            basis.name, basis.N, off, matrices=reduced.matrices, gain=gain, error_K=error_K,
+            basis.name, basis.N, distance, matrices=reduced.matrices, gain=gain, error_K=error_K,
             abscissa_full=known.abscissa, certified=known.certified, sampled=known.sampled,
             examined=self.loop.complete,
         )  # fmt: skip
 
     def examined(self, report: GainReport) -> GainReport:
-        """With the spectrum of the full plant; not certified where it does not converge. Collective."""
+        """The report with the spectrum of the full plant; not certified where it does not converge. Collective."""
         if report.examined or report.gain is None:
             return report
         try:
@@ -307,7 +308,7 @@ class GainCheck:
         )
 
     def with_quality[Figures: GainQuality](self, report: Figures, gain: Gain) -> Figures:
-        """The same with the figures of a gain. Collective. Raises SolverError: see :meth:`quality`."""
+        """The report with errors, poles and cost of a gain. Collective. Raises SolverError: see :meth:`quality`."""
         quality = self.quality(gain)
         return replace(
             report, gain=gain, error_K=gain_error(self.problem, self.solution.gain, gain),

@@ -8,7 +8,7 @@ import numpy as np
 from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.fem.petsc import Array, PETSc, from_options, total
 from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
 from softgrasp.fem.system import dynamic_stiffness
 from softgrasp.lqr.dense.modal import modes_of_plant
@@ -238,6 +238,7 @@ class Resolvent:
         eps.setWhichEigenpairs(SLEPc.EPS.Which.LARGEST_MAGNITUDE)
         eps.setDimensions(nev=count, ncv=min(2 * count + 16, self.layout.states))
         eps.setTolerances(TOLERANCE, ITERATIONS)
+        from_options(eps)
         start = self.shell.createVecRight()
         nodes = self.layout.nodes.ravel()
         start.array_w[: self.extra] = 1.0

@@ -24,7 +24,7 @@ from mpi4py import MPI
 from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError, raise_on_all_ranks
-from softgrasp.fem.petsc import Array, PETSc, on_root, total
+from softgrasp.fem.petsc import Array, PETSc, from_options, on_root, total
 from softgrasp.reduction.bases.states import BasisError
 
 EngineName = Literal["tsqr", "svd", "gram"]
@@ -135,6 +135,7 @@ def _svd(comm: MPI.Intracomm, X: Array, rows: int, k: int | None) -> tuple[Array
     if leading:
         svd.setDimensions(nsv=k)
         svd.setTolerances(SVD_TOLERANCE, 1000)
+    from_options(svd)
     u, v = A.createVecLeft(), A.createVecRight()
     try:
         svd.solve()

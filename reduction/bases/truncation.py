@@ -15,7 +15,7 @@ PAPER_ENERGY = 0.999  # of the POD functional [SBRH21]
 
 @dataclass(frozen=True)
 class Part:
-    """One ordered family of units, each of one column or of a symplectic pair."""
+    """Vectors of one quantity in the order of their importance, by units: one column each, or a symplectic pair."""
 
     title: str  # what it spans, for messages
     sigma: Array  # importance of the units over ``scale``, descending (singular values)

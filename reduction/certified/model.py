@@ -64,14 +64,14 @@ class CertifiedModel(Shown):
         k: modes of the answer; k2 when there is one basis.
         norms: residual norms of the larger basis.
         compliance: sqrt(c' K_r^-1 c) of every output component, (p,).
-        box: where it was trained; None: nowhere.
+        box: materials of the training; None: it was not trained.
         tolerance: relative error above which a run is refused; None: never.
         certify: "two" bases, the "proof" of one, or the "estimate" of two.
-        norm: in which the tolerance counts, "energy" or "output".
-        mesh: error of the mesh at some parameters.
+        norm: of the tolerance, "energy" or "output".
+        mesh: estimates of the mesh's error at some parameters.
         drive: the motion of the scene.
-        training: what the greedy did, for archive and reports.
-        duals: of the outputs, for sharper bounds on them; None: the bound of the energy norm alone.
+        training: steps, sizes and end of the training, for archive and reports.
+        duals: dual problems of the outputs, for sharper bounds; None: outputs have the bound of the energy norm alone.
     """
 
     fine: ReducedModel
@@ -211,10 +211,11 @@ class CertifiedModel(Shown):
         return [CertifiedRun(answer.trajectory(drive.dt, names), certificate) for answer, certificate in found]
 
     def certificates(self, many: Sequence[Materials], drive: Drive | None = None) -> list[Certificate]:
-        """What :meth:`run_batch` proves, without the states."""
+        """Certificates of :meth:`run_batch`, without the states."""
         return [certificate for _, certificate in self._each(many, self._given(drive))]
 
     def _given(self, drive: Drive | None) -> Drive:
+        """The drive, or the scene's motion. Raises ModelError: there is neither."""
         drive = self.drive if drive is None else drive
         if drive is None:
             raise ModelError("give the motion of the hand, or the force on it; the model has none", self.fine.name)
@@ -243,6 +244,7 @@ class CertifiedModel(Shown):
                 yield answer, replace(certificate, tolerance=tolerance, mesh=self.mesh, norm=self.norm)
 
     def _motions(self, k: int, many: Sequence[Materials], drive: Drive, g: Array, residual: bool) -> list[Motion]:
+        """Runs of the leading k modes at every parameter, with their residuals where these are needed."""
         model = self.fine if k == self.k2 else self.coarse
         norms = self.norms if residual else None
         hand = known_hand(model, drive, g)
@@ -271,6 +273,7 @@ class CertifiedModel(Shown):
         return result
 
     def _certificate(self, materials: Materials, answer: Motion, fine: Motion, drive: Drive, g: Array) -> Certificate:
+        """Bounds and estimates of the answer from the run of the larger basis."""
         size, rigid = answer.size, answer.q_s @ self.fine.outputs.C_s.T
         deformation = float(bounds.lengths((answer.outputs - rigid).T).max())
         estimate = wide = sharper = None
@@ -317,12 +320,13 @@ class CertifiedModel(Shown):
         return self._energy(self.fine, materials, d, drive)
 
     def _energy(self, model: ReducedModel, materials: Materials, d: Array, drive: Drive) -> Array:
+        """Energy norm |d|_E of states (steps + 1, N), (steps + 1,)."""
         small = model.at(materials)
         energy = small.total_energy(d) if self._coupled(drive) else small.energy(d)
         return np.asarray(np.sqrt(np.maximum(2 * energy, 0.0)))
 
     def _bound(self, motion: Motion, materials: Materials, drive: Drive) -> Array:
-        """Static bound of a run, (steps + 1,)."""
+        """Static bound of the energy norm of a run's error, (steps + 1,)."""
         r = motion.residual
         assert r is not None
         kernel, betas = None, {m.beta for m in materials}

@@ -22,7 +22,7 @@ from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.material import LayerMaterial
-from softgrasp.fem.petsc import Array, PETSc, times_columns, total
+from softgrasp.fem.petsc import Array, PETSc, from_options, times_columns, total
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from softgrasp.fem.system import BlockSystem
@@ -276,6 +276,7 @@ def highest_frequency(system: BlockSystem) -> float:
     ksp.setType("cg")
     ksp.getPC().setType("jacobi")
     ksp.setTolerances(rtol=1e-10, max_it=500)
+    from_options(eps)
     try:
         eps.solve()
         if eps.getConverged() < 1:

@@ -12,16 +12,10 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.errors import SolverError
-from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.petsc import on_root
-from softgrasp.fem.run.frames import frame_count
-from softgrasp.lqr.dense.care import solve_reduced
+from softgrasp.fem import Model, SolverError, frame_count, on_root, scene_hash
+from softgrasp.lqr import ControlError, Design, PlantState, RiccatiProblem, finite_problem, solve, solve_reduced
 from softgrasp.lqr.design.controller import CertifiedController, NoController, certified_controller
 from softgrasp.lqr.design.duration import LoopPlan, largest_cost
-from softgrasp.lqr.design.feedback import Design
-from softgrasp.lqr.design.linearise import finite_problem
 from softgrasp.lqr.design.orders import (
     BasisGains,
     Notify,
@@ -35,19 +29,14 @@ from softgrasp.lqr.design.orders import (
 from softgrasp.lqr.loop.controller import Controller, save_gain
 from softgrasp.lqr.loop.cost import overshoot, predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory
-from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.gain import PlantState
-from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import rest
 from softgrasp.lqr.reduced.bases import A_PRIORI, BasisFamily
 from softgrasp.lqr.reduced.retune import Materials, RetunedGain, Retuner, retuned_gain
 from softgrasp.lqr.reduced.riccati import GainCheck, GainReport
-from softgrasp.lqr.riccati import solve
-from softgrasp.reduction.parameters import grid_of, materials_at, outside
+from softgrasp.reduction import grid_of, materials_at, outside
 from softgrasp.study.control.result import ControlStudy, FiniteLoop, GainStudy, LoopRuns, ReducedLoopRun, Retuned
-from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.pictures.shapes import move_steps
-from softgrasp.study.shell.timing import repeated
+from softgrasp.study.pictures import Frames, move_steps
+from softgrasp.study.shell import repeated
 
 NEAR = 0.01  # of the way, which a loop that settles comes to
 SHOWN_MODES = 20  # whose poles are drawn
@@ -83,11 +72,13 @@ def tick_seconds(controller: Controller) -> float:
 
 
 def save_controllers(study: GainStudy, out: Path, target: PlantState) -> list[Path]:
-    """controller.npz for the robot, gain.npz of full order with x_bar. Collective."""
+    """controller.npz and observer.npz for the robot, gain.npz of full order with x_bar. Collective."""
     design, layout = study.design, study.design.problem.layout
     files = []
     if study.controller is not None and layout.comm.rank == 0:
         files.append(study.controller.controller.save(out / "controller.npz"))
+    if study.observed is not None and layout.comm.rank == 0:
+        files.append(study.observed.observed.controller.save(out / "observer.npz"))
     return [*files, save_gain(out / "gain.npz", design.gain, target, layout, scene_hash(design.model.scene))]
 
 

@@ -12,15 +12,10 @@ from matplotlib.colors import LogNorm
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, MultipleLocator, NullFormatter
 
-from softgrasp.fem.petsc import Array
-from softgrasp.lqr.design.orders import BasisGains
-from softgrasp.lqr.loop.margins import LoopMargins
-from softgrasp.lqr.reduced.bases import A_PRIORI
+from softgrasp.fem import Array
+from softgrasp.lqr import A_PRIORI, BasisGains, LoopMargins
 from softgrasp.study.control.result import TITLES, ControlStudy, LoopRuns, Retuned
-from softgrasp.study.pictures import style
-from softgrasp.study.pictures.body import figure_move
-from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.pictures.loop import Poles, figure_decay, histories
+from softgrasp.study.pictures import Frames, Poles, figure_decay, figure_move, histories, style
 
 LOOKS = {
     "pod": (style.BLUE, "-", "o"),

@@ -9,19 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.columns import hand_columns
-from softgrasp.lqr.design.feedback import Design, running_words
-from softgrasp.lqr.design.orders import BasisGains
-from softgrasp.lqr.loop.margins import LoopMargins
-from softgrasp.lqr.plant.problem import RiccatiSolution, rigid_gains
-from softgrasp.lqr.reduced.riccati import GainQuality
+from softgrasp.fem import hand_columns
+from softgrasp.lqr import BasisGains, Design, GainQuality, LoopMargins, RiccatiSolution, rigid_gains, running_words
 from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, gain_change, settled
 from softgrasp.study.forward.result import trajectory_header
-from softgrasp.study.pictures.shapes import speed_up
+from softgrasp.study.pictures import speed_up
+from softgrasp.study.report import Columns, Section, Table, captioned, entry, table_of
 from softgrasp.study.report.equation import control_equation
-from softgrasp.study.report.page import Section, captioned
-from softgrasp.study.report.tables import Columns, Table, entry, table_of
-from softgrasp.study.shell.session import Page
+from softgrasp.study.shell import Page
 
 Row = tuple[Any, ...]
 LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal")
@@ -266,7 +261,9 @@ def compose(study: GainStudy, seconds: Mapping[str, float], pictures: Sequence[P
     noted = [Section("Notes", text=notes, terminal=True)] if notes else []
     result = Section("Result", rows=result_rows(study, seconds), terminal=True)
     if not isinstance(study, ControlStudy):
-        return Page(f"{name}: optimal gain", summary(study), [*noted, result], {}, files, " --gain-only")
+        return Page(
+            f"{name}: optimal gain", summary(study), [*noted, *_observed(study), result], {}, files, " --gain-only"
+        )
     parts, outcome = sections(study, noted, result, pictures), summary(study)
     if study.planned is not None:
         from softgrasp.study.control.obstacle.report import sentence
@@ -293,6 +290,7 @@ def sections(study: ControlStudy, notes: Sequence[Section], result: Section, dra
         Section("", figures=pick("move.png", "move.gif")),
         *notes,
         *planned,
+        *_observed(study),
         replace(result, figures=pick("histories.png", "decay.png")),
         Section("Equation", equation=control_equation(study.design.model.scene)),
     ]
@@ -305,6 +303,15 @@ def sections(study: ControlStudy, notes: Sequence[Section], result: Section, dra
         own = [] if i else pick("retune.png")
         parts.append(table_of(r.points, BOX, "" if i else "Re-tuning").section(text, figures=own))
     return parts
+
+
+def _observed(study: GainStudy) -> list[Section]:
+    """The observer, where there is one."""
+    if study.observed is None:
+        return []
+    from softgrasp.study.control.observer.report import observer_sections
+
+    return observer_sections(study.observed)
 
 
 def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Section]:

@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem.columns import farthest
-from softgrasp.fem.petsc import Array
-from softgrasp.lqr.design.controller import CertifiedController
-from softgrasp.lqr.design.duration import LoopPlan
+from softgrasp.fem import Array, farthest
+from softgrasp.lqr import BasisGains, CertifiedController, GainQuality, LoopPlan, LoopTrajectory, RetunedGain, Target
 from softgrasp.lqr.design.feedback import Design, running_words
-from softgrasp.lqr.design.orders import BasisGains
-from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
 from softgrasp.lqr.plant.problem import RiccatiSolution, rigid_gains, translation_defect, velocity_defect
-from softgrasp.lqr.plant.target import Target
-from softgrasp.lqr.reduced.retune import RetunedGain
-from softgrasp.lqr.reduced.riccati import GainQuality
 from softgrasp.study.forward.result import newton_keys
 from softgrasp.study.report.origin import origin, peak_memory_mb
 
-if TYPE_CHECKING:  # plans are not imported where a scene asks for none
+if TYPE_CHECKING:  # plans and observers are not imported where a scene has none
+    from softgrasp.study.control.observer.result import ObservedStudy
     from softgrasp.study.control.obstacle.result import PlannedStudy
 
 TITLES = {
@@ -105,6 +99,7 @@ class GainStudy:
     controller: CertifiedController | None  # the small controller; None when no small gain is certified
     tick: float  # seconds of one tick of it, median
     notes: tuple[str, ...]  # what was chosen for the user, and why parts are missing
+    observed: ObservedStudy | None = field(default=None, kw_only=True)  # the observer; None where the scene has none
 
     @cached_property
     def margins(self) -> LoopMargins | None:
@@ -154,6 +149,7 @@ class GainStudy:
             "findings": self.findings,
             "damping_enough": d.diagnosis.damping_enough,
             "controller": controller,
+            **({} if self.observed is None else {"observer": self.observed.result()}),
             "notes": self.notes,
             "time": {**seconds, "solver": dict(solution.seconds)},
             "memory_peak_mb": peak_memory_mb(layout.comm),

@@ -11,23 +11,15 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TaskProgressColumn
 
-from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.owned import remove_own
-from softgrasp.fem.scene.control import Loop
+from softgrasp.fem import Loop, Model, Stopwatch, remove_own, scene_hash
+from softgrasp.lqr import A_PRIORI, Design, PlantState, control_of, finite_problem, linearised, with_control
 from softgrasp.lqr.design.duration import plan
-from softgrasp.lqr.design.feedback import Design, design
-from softgrasp.lqr.design.linearise import finite_problem, linearised
+from softgrasp.lqr.design.feedback import design
 from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, reduce_gains
-from softgrasp.lqr.design.scene import control_of, with_control
-from softgrasp.lqr.plant.gain import PlantState
-from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control import measure, report
 from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
-from softgrasp.study.pictures.background import draw_in_background
-from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Flags, Page, Session
+from softgrasp.study.pictures import Frames, draw_in_background
+from softgrasp.study.shell import Flags, Page, Session, folder_lock
 
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 
@@ -67,12 +59,18 @@ def run_control(
             word = "going on from" if exists else "interrupted, the same command goes on from"
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
         feedback = design(linearised(model), watch, solver_bar(bar, model), restart)
+        observed = None
+        if control_of(model).observer is not None:  # first: what has no observer is refused at once
+            from softgrasp.study.control.observer.measure import observed_study  # no other scene needs it
+
+            observed = observed_study(feedback, watch)
         if gain_only:
             study = small_study(feedback, watch, sentence)
         else:
             study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence)
             if retune:
                 study = with_retuning(model, study, watch, bar)
+    study = replace(study, observed=observed)
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
         saved = measure.save_controllers(study, out, end_state(model, study))

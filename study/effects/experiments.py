@@ -8,17 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.errors import SceneError
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem import EFFECTS, Array, Scene, SceneError, TissueMesh, Trajectory, make_outputs, young_poisson
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import Force, motion_table
 from softgrasp.fem.run.simulate import RunOptions, simulate
-from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.fem.scene.materials import young_poisson
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.result import Change, Elements
 from softgrasp.study.effects.switch import Scales, switch
 from softgrasp.study.forward.cautions import LOCKING

@@ -20,16 +20,10 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.checksums import digest
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh
-from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.petsc import Array, PETSc
-from softgrasp.fem.run.simulate import Run, RunOptions
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.solve.solvers import ITERATIVE
+from softgrasp.fem import ITERATIVE, Array, Model, PETSc, Run, RunOptions, Scene, TissueMesh, build, digest
 from softgrasp.study.effects.result import Cost, ZeroCostCheck
 from softgrasp.study.effects.switch import neutral
-from softgrasp.study.shell.timing import RepeatableRun, interleave, medians, rotated
+from softgrasp.study.shell import RepeatableRun, interleave, medians, rotated
 
 BURSTS = 7  # short ones make a sample by their median, so that a busy moment of the machine falls out
 BURST_SECONDS = 0.02  # of the steps of one; long against the timer

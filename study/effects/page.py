@@ -11,12 +11,11 @@ import matplotlib.pyplot as plt
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import Scene
 from softgrasp.study.effects.result import EffectResult, EffectsStudy
-from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, OUTLINE, WIDTH, paper_style, save
-from softgrasp.study.report.page import Section
-from softgrasp.study.report.tables import Columns, Table, listed, percent, table_of
-from softgrasp.study.shell.session import Page, Session
+from softgrasp.study.pictures import BLUE, GREEN, HAND, ORANGE, OUTLINE, WIDTH, paper_style, save
+from softgrasp.study.report import Columns, Section, Table, listed, percent, table_of
+from softgrasp.study.shell import Page, Session
 
 CAPTION = (
     "Each effect switched on against off, the rest of the scene as it is. Left: largest change of the outputs over the "

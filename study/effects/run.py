@@ -13,12 +13,7 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
-from softgrasp.fem.accuracy import adapt
-from softgrasp.fem.errors import ResourceError, SolverError
-from softgrasp.fem.model.memory import free_bytes
-from softgrasp.fem.model.scales import rigid_inertia
-from softgrasp.fem.resources import size_text
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import ResourceError, Scene, SolverError, adapt, free_bytes, rigid_inertia, size_text
 from softgrasp.study.effects.experiments import SwitchRuns, check_elements
 from softgrasp.study.effects.measure import (
     AGAIN,
@@ -37,8 +32,7 @@ from softgrasp.study.effects.together import Changes, advised
 from softgrasp.study.effects.verdict import assess, shows
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
-from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Session
+from softgrasp.study.shell import Session, folder_lock
 
 TIMER = 0.03  # relative difference of two equal runs that cache and page placement can leave in every sample
 

@@ -12,9 +12,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.effects.gravity import EARTH
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import EARTH, EFFECTS, Scene
 
 TRIAL_ZETA = 0.01  # ratio of the first mode; silicone and passive tissue lie above, so it is a careful guess
 TRIAL_LAW = "neo-hooke"

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
-from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.errors import SolverError
+from softgrasp.fem import EFFECTS, SolverError
 from softgrasp.study.effects.experiments import Names, SwitchRuns
 from softgrasp.study.effects.result import Change, JointChange
 

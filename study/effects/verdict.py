@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import EFFECTS, Scene
 from softgrasp.study.effects.measure import AGAIN, SCENE, MeasuredScene, check_zero_cost, cost_of
 from softgrasp.study.effects.result import Change, Cost, EffectResult, JointChange
 from softgrasp.study.effects.switch import Switch
 from softgrasp.study.effects.together import Changes, JointAdvice, Rival
 from softgrasp.study.forward.explain import EffectReport, Explanation
-from softgrasp.study.report.tables import listed, percent
+from softgrasp.study.report import listed, percent
 
 
 def verdict_of(change: float, controls: bool, costs: bool, tolerance: float) -> str:

@@ -1,4 +1,4 @@
-"""``softgrasp export``: a saved reduced model as C."""
+"""``softgrasp export``: a saved reduced model as C and as FMU."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from rich.console import Console
 
 from softgrasp.fem.errors import SceneError, raise_on_all_ranks
 from softgrasp.reduction.archive import load
-from softgrasp.reduction.export import write_c
+from softgrasp.reduction.export import write_c, write_fmu
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.study.shell.session import list_files
 
-DOORS = "--c FOLDER"
+DOORS = "--c FOLDER or --fmu FILE"
 
 
-def run_export(path: Path, console: Console, *, c: Path | None = None, tick: float = 1e-3) -> None:
+def run_export(
+    path: Path, console: Console, *, c: Path | None = None, fmu: Path | None = None, tick: float = 1e-3
+) -> None:
     """Write a saved model for other programs, see ``softgrasp export --help``. Collective; rank 0 writes.
 
     Raises:
@@ -25,16 +27,19 @@ def run_export(path: Path, console: Console, *, c: Path | None = None, tick: flo
     """
     with raise_on_all_ranks(MPI.COMM_WORLD):
         if MPI.COMM_WORLD.rank == 0:
-            _export(path, console, c, tick)
+            _export(path, console, c, fmu, tick)
 
 
-def _export(path: Path, console: Console, c: Path | None, tick: float) -> None:
-    if c is None:
+def _export(path: Path, console: Console, c: Path | None, fmu: Path | None, tick: float) -> None:
+    if c is None and fmu is None:
         raise SceneError(f"softgrasp export {path}: name what to write: {DOORS}")
     model = load(path)
     if not isinstance(model, ReducedModel):
         raise SceneError(f"{path}: only linear reduced models are exported; this one is of finite strain")
-    files = write_c(model, c, tick)
+    if fmu is not None and fmu.suffix != ".fmu":
+        raise SceneError(f"--fmu {fmu}: simulators know an FMU by its ending; name it {fmu.with_suffix('.fmu').name}")
+    files = [] if c is None else write_c(model, c, tick)
+    files += [] if fmu is None else [write_fmu(model, fmu, tick)]
     console.print(f"{path.name}: {model.name}, N = {model.N}, a tick of {tick:g} s", soft_wrap=True, markup=False)
     list_files(console, files)
     if model.structure == "none":
@@ -43,4 +48,5 @@ def _export(path: Path, console: Console, c: Path | None, tick: float) -> None:
             "C does not test; craig_bampton and the psd bases are stable with all",
             style="yellow", soft_wrap=True, markup=False,
         )  # fmt: skip
-    console.print(f"next: make -C {shlex.quote(str(c))} test time", soft_wrap=True, markup=False)
+    if c is not None:
+        console.print(f"next: make -C {shlex.quote(str(c))} test time", soft_wrap=True, markup=False)

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem.accuracy.adapt import estimated
+from softgrasp.fem import SoftgraspError, estimated
 from softgrasp.fem.accuracy.price import affordable, plans
-from softgrasp.fem.errors import SoftgraspError
-from softgrasp.study.report.tables import percent
+from softgrasp.study.report import percent
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import MeshEstimate, Model

@@ -4,17 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgrasp.fem.effects.finite_strain import linear_error
-from softgrasp.fem.effects.gate import SMALL_SHARE
-from softgrasp.fem.model.build import Model
+from softgrasp.fem import ITERATIVE, SMALL_SHARE, BlockSystem, Model, Trajectory, linear_error, motion_table, spread
 from softgrasp.fem.model.scales import SMALL_STRAIN, gradient, magnified, slowest
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.motion import motion_table
-from softgrasp.fem.run.snapshots import spread
-from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.materials import young_poisson
-from softgrasp.fem.solve.solvers import ITERATIVE
-from softgrasp.fem.system import BlockSystem
 
 STIFF = 0.45  # P1 displacements lock above: the error grows like 1 / (1 - 2 nu) = lambda / mu + 1 [BS92]
 LOCKING = 0.49  # where `effects` measures it

@@ -9,20 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.accuracy.estimate import extrapolated
+from softgrasp.fem import SMALL_STRAIN, Scene, expected_order, extrapolated, largest_acceleration, lowest_modes, spread
 from softgrasp.fem.effects import EFFECTS, Gate
 from softgrasp.fem.effects.gate import SMALL_SHARE, Sag
 from softgrasp.fem.errors import MeshError, SceneError
-from softgrasp.fem.mesh.singular import expected_order
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.memory import Need, factor_bytes, free_bytes, need, solver_of
 from softgrasp.fem.model.refined import by_lines, scene_ends
-from softgrasp.fem.model.scales import SMALL_STRAIN, measure
+from softgrasp.fem.model.scales import measure
 from softgrasp.fem.run.forecast import Forecast, forecasts
-from softgrasp.fem.run.motion import largest_acceleration
-from softgrasp.fem.run.snapshots import spread
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT, factor_on_every_rank
 from softgrasp.study.forward.accuracy import estimate_error
 from softgrasp.study.forward.cautions import (
@@ -35,8 +30,8 @@ from softgrasp.study.forward.cautions import (
     turned,
 )
 from softgrasp.study.forward.result import ModelSizes, model_sizes, output_places
+from softgrasp.study.report import to_json
 from softgrasp.study.report.equation import Equation, equation
-from softgrasp.study.report.files import to_json
 
 if TYPE_CHECKING:  # plans are not imported where a scene asks for none
     from softgrasp.lqr.design.constrained import PlanSizes

@@ -8,16 +8,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from softgrasp.fem.effects.gate import SMALL_SHARE
-from softgrasp.fem.model.scales import SMALL_STRAIN
-from softgrasp.fem.resources import size_text
-from softgrasp.fem.run.forecast import RELIABLE, START, Forecast
+from softgrasp.fem import SMALL_SHARE, SMALL_STRAIN, Forecast, size_text
+from softgrasp.fem.run.forecast import RELIABLE, START
 from softgrasp.study.forward.explain import EffectReport, Explanation, MeshReport, explain
+from softgrasp.study.report import EQUATION, Section, listed, percent
 from softgrasp.study.report.origin import origin
-from softgrasp.study.report.page import EQUATION, Section
-from softgrasp.study.report.tables import listed, percent
-from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Page, Session
+from softgrasp.study.shell import Page, Session, folder_lock
 
 OPERATORS = (
     "Operators are matrices and columns over the mesh. `softgrasp effects` adds up the memory of all that a run holds, "

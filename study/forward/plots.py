@@ -7,9 +7,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from softgrasp.fem.model.build import MeshEstimate
-from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.study.pictures.style import COLUMN, CYCLE, length_unit, paper_style, save
+from softgrasp.fem import MeshEstimate, Trajectory
+from softgrasp.study.pictures import COLUMN, CYCLE, length_unit, paper_style, save
 
 
 def figure_mesh_error(out_png: Path, run: Trajectory, result: MeshEstimate) -> tuple[Path, ...]:

@@ -8,15 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem.columns import Columns, hand_columns
-from softgrasp.fem.mesh.check import counted
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.petsc import PETSc
-from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import Columns, Model, PETSc, Scene, Trajectory, counted, hand_columns, make_outputs
+from softgrasp.study.report import Table
 from softgrasp.study.report.origin import origin, peak_memory_mb
-from softgrasp.study.report.tables import Table
 
 if TYPE_CHECKING:
     from softgrasp.fem.run.contact_record import ContactRecord

@@ -10,23 +10,17 @@ import numpy as np
 from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
-from softgrasp.fem.accuracy.price import SHARE, run_seconds
-from softgrasp.fem.effects import EFFECTS
+from softgrasp.fem import EFFECTS, FRAMES, Scene, check_ranks, counted, forecasts, frame_count, run_seconds, told
+from softgrasp.fem.accuracy.price import SHARE
 from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError, SolverError
-from softgrasp.fem.mesh.check import counted
-from softgrasp.fem.run.checkpoint import check_ranks
-from softgrasp.fem.run.forecast import forecasts, told
-from softgrasp.fem.run.frames import FRAMES, LIGHT, frame_count
+from softgrasp.fem.run.frames import LIGHT
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estimate_error
 from softgrasp.study.forward.cautions import looked_at, run_warnings, small_obstacles
 from softgrasp.study.forward.result import Simulation, simulate_result
-from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.pictures.shapes import speed_up
-from softgrasp.study.report.page import Section, captioned, of_scene
-from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Flags, Page, Session, list_files
+from softgrasp.study.pictures import Frames, speed_up
+from softgrasp.study.report import Section, captioned, of_scene
+from softgrasp.study.shell import Flags, Page, Session, folder_lock, list_files
 
 CAPTIONS = {
     "move.png": "The body at some instants of the move.",

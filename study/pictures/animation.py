@@ -14,19 +14,8 @@ import numpy.typing as npt
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from softgrasp.fem.columns import Array
-from softgrasp.fem.fields.picture import PictureMesh
-from softgrasp.fem.owned import note
-from softgrasp.study.pictures.body import (
-    Shot,
-    colour_bar,
-    draw_scene,
-    draw_surroundings,
-    legend,
-    make_axes,
-    make_shot,
-    name_layers,
-)
+from softgrasp.fem import Array, PictureMesh, note
+from softgrasp.study.pictures import body
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.pictures.style import TARGET, colour_map, fit, paper_style
 
@@ -64,7 +53,7 @@ def move_bytes(
     """
     kept, durations = timing(times)
     frames, times = frames[kept].astype(np.float64), times[kept]
-    shot = make_shot(picture, frames, times, table, target, None if tractions is None else tractions[kept])
+    shot = body.make_shot(picture, frames, times, table, target, None if tractions is None else tractions[kept])
     return gif_bytes(_render(shot, frames, times), durations)
 
 
@@ -81,22 +70,22 @@ def timing(times: Array) -> tuple[list[int], list[int]]:
     return kept, [*(10 * max(int(at[j] - at[i]), TICKS) for i, j in pairwise(kept)), int(1000 * REST)]
 
 
-def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
+def _render(shot: body.Shot, frames: Array, times: Array) -> list[Any]:
     """One picture per frame, all of one size."""
     fast = speed_up(times)
     digits = int(np.clip(2 - np.floor(np.log10(times[-1] or 1.0)), 0, 6))
     note = f" ({fast:g}×)" if fast != 1 else ""
     with paper_style():
-        figure, axes = make_axes(shot, 1, captions=False, width=5.4, tallest=4.2)
+        figure, axes = body.make_axes(shot, 1, captions=False, width=5.4, tallest=4.2)
         # The longest text first, so that all frames have the size of the first.
         stamp = axes[0].set_title(f"t = {times[-1]:.{digits}f} s{note}", pad=3)
-        colour_bar(figure, axes, shot)
-        legend(figure, axes, shot)
+        body.colour_bar(figure, axes, shot)
+        body.legend(figure, axes, shot)
 
         def draw(k: int) -> None:
-            draw_surroundings(axes[0], shot, [k])
-            draw_scene(axes[0], shot, frames[k : k + 1], None, shot.hands[k : k + 1])
-            name_layers(axes[0], shot, frames[k], inside=True)  # beside the body they would change sides
+            body.draw_surroundings(axes[0], shot, [k])
+            body.draw_scene(axes[0], shot, frames[k : k + 1], None, shot.hands[k : k + 1])
+            body.name_layers(axes[0], shot, frames[k], inside=True)  # beside the body they would change sides
             stamp.set_text(f"t = {times[k]:.{digits}f} s{note}")
 
         return film(figure, axes, draw, range(len(times)), [stamp])

@@ -16,7 +16,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from softgrasp.fem.owned import note
+from softgrasp.fem import note
 
 Draw = Callable[[Path], list[Path]]
 

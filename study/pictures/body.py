@@ -20,8 +20,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from matplotlib.tri import Triangulation
 
-from softgrasp.fem.columns import Array
-from softgrasp.fem.fields.picture import PictureMesh
+from softgrasp.fem import Array, PictureMesh
 from softgrasp.study.pictures import shapes, style
 from softgrasp.study.pictures.style import colour_map, length_unit, paper_style, pressure_unit, save
 

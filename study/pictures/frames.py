@@ -7,17 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from softgrasp.fem import Array, Model, Run, SeriesWriter, Trajectory, frame_steps, note_of, remove_own, total
 from softgrasp.fem.checksums import AGAIN, read_arrays, write_arrays
 from softgrasp.fem.errors import CheckpointError, raise_on_all_ranks
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement, vertex_values
-from softgrasp.fem.fields.series import SeriesWriter
-from softgrasp.fem.fields.vtu import note_of
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.owned import remove_own
-from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.frames import frame_steps
-from softgrasp.fem.run.simulate import Run
-from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.study.pictures.shapes import way_done
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.lines import Line2D
 
-from softgrasp.fem.columns import AXES, Array, Columns, farthest
+from softgrasp.fem import AXES, Array, Columns, farthest
 from softgrasp.study.pictures import style
 from softgrasp.study.pictures.style import few_ticks, length_unit, paper_style, save
 

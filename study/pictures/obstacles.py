@@ -9,8 +9,7 @@ import numpy as np
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 
-from softgrasp.fem.obstacles import Ball, HalfSpace, Obstacle, Polytope, Shape
-from softgrasp.fem.petsc import Array
+from softgrasp.fem import Array, Ball, HalfSpace, Obstacle, Polytope, Shape
 from softgrasp.study.pictures import shapes
 from softgrasp.study.pictures.style import HAND, OUTLINE
 

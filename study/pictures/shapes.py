@@ -10,8 +10,7 @@ from PIL import Image, ImageDraw, ImageFilter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from softgrasp.fem.columns import Array
-from softgrasp.fem.fields.picture import PictureMesh
+from softgrasp.fem import Array, PictureMesh
 
 ELEVATION, AZIMUTH = 18.0, -58.0  # view of 3D scenes [degree]
 SHORTEST, LONGEST = 0.3, 30.0  # [s], beyond them an animation runs slower or faster than the move

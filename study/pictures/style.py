@@ -15,8 +15,8 @@ import numpy as np
 from cycler import cycler
 from PIL import Image
 
-from softgrasp.fem.owned import note
-from softgrasp.study.pictures import PDF
+from softgrasp.fem import note
+from softgrasp.study.pictures.pdf import PDF
 
 if "inline" not in os.environ.get("MPLBACKEND", ""):  # a notebook shows figures by its own
     mpl.use("Agg")

@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from softgrasp.fem.columns import AXES, Array, Columns, hand_columns
+from softgrasp.fem import AXES, Array, Columns, hand_columns
 from softgrasp.study.pictures.style import COLUMN, CYCLE, HAND, STEPS, length_unit, paper_style
 
 

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.errors import ResourceError, SceneError, no_pipe
-from softgrasp.fem.fields.vtu import Collection, check_file
+from softgrasp.fem import Collection, ResourceError, SceneError, check_file, no_pipe
 
 SHOWN = 4  # number of bodies in a picture, equally spaced in time, first and last included
 PEAK = 99  # percentile of the field at the end of the colour scale: corners are singular [%]

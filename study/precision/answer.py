@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem import SceneError
 from softgrasp.study.precision.fit import series_of, usable
 from softgrasp.study.precision.forward import to_point
 from softgrasp.study.precision.full import FullRuns

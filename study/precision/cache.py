@@ -14,12 +14,9 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp import package_version
-from softgrasp.fem.checksums import read_manifest, write_manifest
+from softgrasp.fem import Array, Scene, read_manifest, scene_hash, write_manifest
 from softgrasp.fem.errors import CheckpointError, Interrupted, raise_on_all_ranks
-from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.petsc import Array
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.report.files import to_json
+from softgrasp.study.report import to_json
 
 FORMAT = 4  # of the cached files
 

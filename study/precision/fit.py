@@ -9,7 +9,7 @@ import numpy as np
 
 from softgrasp.study.precision.points import WorkPoint
 from softgrasp.study.reduce.linear.result import unbeaten
-from softgrasp.study.shell.timing import power_law
+from softgrasp.study.shell import power_law
 
 GAIN = 0.01  # of the error: what a slower point must gain to be on the front
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from softgrasp.fem.mesh.singular import Ends, expected_order
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import Ends, Scene, expected_order
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.full import FullRuns, TimedRun, errors_of
 from softgrasp.study.precision.points import ForwardPoint

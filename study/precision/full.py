@@ -16,17 +16,11 @@ import numpy as np
 from mpi4py import MPI
 from scipy.interpolate import CubicSpline
 
-from softgrasp.fem.accuracy import adapt
+from softgrasp.fem import Array, Model, Run, RunOptions, Scene, adapt, build, make_outputs, make_ts, total
 from softgrasp.fem.fields.probe import Probe, make_probe
-from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.simulate import Run, RunOptions
-from softgrasp.fem.run.stepping import make_ts
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.settings import Setting, own_setting, variant
-from softgrasp.study.shell.timing import medians
+from softgrasp.study.shell import medians
 
 REGION_POINTS = 4  # along each axis of the box of a region output
 BURST_SECONDS = 0.05  # of the steps in each repeat after the first, which is the whole run

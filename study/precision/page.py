@@ -33,12 +33,10 @@ from softgrasp.study.precision.tables import (
     slope_table,
 )
 from softgrasp.study.reduce.linear.measure import PAPER_FULL, PAPER_REDUCED
+from softgrasp.study.report import EQUATION, Section, percent, to_json
 from softgrasp.study.report.equation import control_equation
-from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import command_line, origin, peak_memory_mb
-from softgrasp.study.report.page import EQUATION, Section
-from softgrasp.study.report.tables import percent
-from softgrasp.study.shell.session import Page, Session
+from softgrasp.study.shell import Page, Session
 
 PAPER = f"{PAPER_REDUCED} s and a state error of about 1e-3 at N = 14"
 

@@ -12,11 +12,11 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import Formatter, LogLocator, MaxNLocator
 
-from softgrasp.lqr.reduced.bases import BASES
-from softgrasp.reduction.bases.registry import METHODS, OWN_METHODS
+from softgrasp.lqr import BASES
+from softgrasp.reduction import METHODS, OWN_METHODS
 from softgrasp.study.control.plots import LOOKS as BASIS_LOOKS
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
-from softgrasp.study.pictures.style import BLUE, FULL, GREEN, HAND, ORANGE, PURPLE, UNSTABLE, WIDTH, paper_style, save
+from softgrasp.study.pictures import BLUE, FULL, GREEN, HAND, ORANGE, PURPLE, UNSTABLE, WIDTH, paper_style, save
 from softgrasp.study.precision.fit import Slope, pareto, series_of, usable
 from softgrasp.study.precision.forward import on_meshes, over_steps
 from softgrasp.study.precision.points import (

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import MISSING, dataclass, fields
 from typing import Any, ClassVar
 
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem import SceneError
 from softgrasp.study.precision.settings import Refine, Setting
-from softgrasp.study.report.files import to_json
+from softgrasp.study.report import to_json
 
 QUESTIONS = ("forward", "reduced", "bases", "riccati", "reduced_riccati")
 CONTROL = ("riccati", "reduced_riccati")  # of these, the ones about feedback

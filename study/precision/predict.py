@@ -6,8 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import ceil, floor, isfinite, log10
 
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.solve.costs import STEP_RTOL
+from softgrasp.fem import STEP_RTOL, Scene
 from softgrasp.study.precision.fit import interpolate, usable
 from softgrasp.study.precision.forward import over_steps, step_counts
 from softgrasp.study.precision.points import ForwardPoint, ReducedPoint, RiccatiPoint, RunPoint, WorkPoint

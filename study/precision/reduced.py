@@ -11,15 +11,10 @@ from functools import partial
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.fields.probe import Probe, make_probe
-from softgrasp.fem.model.build import Stopwatch
-from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem import Array, Probe, Stopwatch, make_probe, simulate, total
+from softgrasp.reduction import ReducedModel, Stepper, find_method, prepared, states_of
 from softgrasp.reduction.bases.engines import ENGINES, EngineName, Factor, factor, small_svd
-from softgrasp.reduction.bases.registry import find_method
-from softgrasp.reduction.bases.states import states_of
-from softgrasp.reduction.model import ReducedModel
-from softgrasp.reduction.online import Stepper, prepared, run
+from softgrasp.reduction.online import run
 from softgrasp.reduction.propagator import propagator
 from softgrasp.reduction.replay import FullRun, full_run, replay_inputs
 from softgrasp.study.precision.fit import slopes
@@ -29,7 +24,7 @@ from softgrasp.study.precision.result import Question, ReferenceSolution
 from softgrasp.study.precision.settings import Setting
 from softgrasp.study.reduce.linear.measure import bases_of, chosen_methods, measured
 from softgrasp.study.reduce.linear.result import Point
-from softgrasp.study.shell.timing import repeated
+from softgrasp.study.shell import repeated
 
 CALLS = 2_000  # single steps of a reduced model that are timed
 ENGINE_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-8)

@@ -18,8 +18,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from softgrasp.fem.errors import SceneError
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import Scene, SceneError
 from softgrasp.study.precision.full import FullRuns, Series, TimedRun, largest, relative
 from softgrasp.study.precision.result import ReferenceSolution
 from softgrasp.study.precision.settings import Setting, contraction, edges, few_steps, fits

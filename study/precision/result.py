@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import Scene
 from softgrasp.study.precision.fit import Slope, pareto
 from softgrasp.study.precision.full import Series, TimedRun
 from softgrasp.study.precision.points import ReducedPoint, RunPoint, WorkPoint
 from softgrasp.study.precision.settings import Setting
-from softgrasp.study.report.files import to_json
+from softgrasp.study.report import to_json
 
 ADVICE = {
     "space": "a finer mesh than the time allows here",

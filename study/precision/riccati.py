@@ -15,19 +15,14 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.errors import ResourceError, SceneError, SolverError
-from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.petsc import on_root
-from softgrasp.lqr.dense.care import solve_reduced
-from softgrasp.lqr.design.feedback import Design, check, design
+from softgrasp.fem import Model, ResourceError, SceneError, SolverError, Stopwatch, on_root
+from softgrasp.lqr import ControlError, Design, Method, control_of, solve, solve_reduced
+from softgrasp.lqr.design.feedback import check, design
 from softgrasp.lqr.design.orders import orders
-from softgrasp.lqr.design.scene import control_of
 from softgrasp.lqr.design.scene import problem as make_problem
-from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import A_PRIORI, BASES, BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import GainReport, gain_error, reduce_riccati
-from softgrasp.lqr.riccati import Method, solve
 from softgrasp.study.control.measure import with_time
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.control.result import report_dict
@@ -35,7 +30,7 @@ from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.points import CONTROL, ReducedRiccatiPoint, RiccatiPoint
 from softgrasp.study.precision.result import Question, ReducedReference, RiccatiReference
-from softgrasp.study.shell.timing import repeated, timed
+from softgrasp.study.shell import repeated, timed
 
 METHODS: tuple[Method, ...] = ("newton_adi", "radi", "galerkin", "dense")
 TITLES: dict[str, str] = {"newton_adi": "Newton-ADI", "radi": "RADI", "galerkin": "Galerkin", "dense": "dense"}

@@ -10,15 +10,9 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.progress import TaskProgressColumn
 
-from softgrasp.fem.accuracy import adapt
-from softgrasp.fem.errors import ResourceError, SceneError, SolverError
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.refined import scene_ends
-from softgrasp.fem.run.interrupt import interruptible
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.reduced.bases import BASES
-from softgrasp.reduction.bases.engines import ENGINES
+from softgrasp.fem import Model, ResourceError, Scene, SceneError, SolverError, adapt, interruptible, scene_ends
+from softgrasp.lqr import BASES, ControlError
+from softgrasp.reduction import ENGINES
 from softgrasp.study.precision.answer import Answers
 from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.forward import SHARES, ask_forward, mesh_series, solver_settings
@@ -31,8 +25,7 @@ from softgrasp.study.precision.result import Answer, ErrorBudget, Question, Refe
 from softgrasp.study.precision.riccati import ControlRuns, ask_reduced_riccati, ask_riccati, settings_of
 from softgrasp.study.precision.settings import own_setting, variant
 from softgrasp.study.reduce.linear.measure import chosen_methods
-from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Session
+from softgrasp.study.shell import Session, folder_lock
 
 FULL_SNAPSHOTS = 3e8  # entries; beyond them the scene's own run is too large for reduced models in memory
 

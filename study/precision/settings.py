@@ -9,8 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.solve.costs import STEP_RTOL
+from softgrasp.fem import STEP_RTOL, Scene
 
 LEAST_STEPS = 4  # of a run
 Refine = float | Literal["off", "scene"]

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.bases.registry import METHODS
+from softgrasp.fem import Scene
+from softgrasp.reduction import METHODS
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.precision.fit import Slope, pareto
 from softgrasp.study.precision.points import (
@@ -29,7 +29,7 @@ from softgrasp.study.precision.result import (
     WorkStudy,
 )
 from softgrasp.study.precision.riccati import TITLES as METHOD_TITLES
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report import Table
 
 SERIES_TITLES: dict[str, dict[str, str]] = {
     "reduced": {key: method.title for key, method in METHODS.items()},

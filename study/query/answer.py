@@ -9,14 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.columns import hand_columns
-from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.reduction.certified.certificate import Certificate
-from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.reduction.certified.motion import Materials
-from softgrasp.reduction.online import ReducedTrajectory
-from softgrasp.study.report.tables import Table, percent
+from softgrasp.fem import Array, Trajectory, hand_columns
+from softgrasp.reduction import Certificate, CertifiedModel, Materials, ReducedTrajectory
+from softgrasp.study.report import Table, percent
 
 
 @dataclass(frozen=True)

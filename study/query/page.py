@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from softgrasp.reduction.certified.certificate import NORMS, Certificate
-from softgrasp.reduction.certified.model import ParameterDomain
+from softgrasp.reduction import NORMS, Certificate, ParameterDomain
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult, answer_rows
-from softgrasp.study.report.page import Section, captioned
-from softgrasp.study.report.tables import Table, listed, percent
-from softgrasp.study.shell.session import Page, Session
+from softgrasp.study.report import Section, Table, captioned, listed, percent
+from softgrasp.study.shell import Page, Session
 
 CAPTIONS = {
     "answer.png": "Outputs against the hand with the band that the error bound leaves (often thinner than the line); "

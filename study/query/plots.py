@@ -9,8 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
 
-from softgrasp.study.pictures import style
-from softgrasp.study.pictures.style import few_ticks, length_unit, paper_style, save
+from softgrasp.study.pictures import few_ticks, length_unit, paper_style, save, style
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
 
 LEAST = 1e-16  # of an error that is drawn

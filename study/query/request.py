@@ -12,13 +12,9 @@ from typing import Literal
 
 import numpy as np
 
-from softgrasp.fem.errors import SceneError, shortened
-from softgrasp.fem.resources import free_memory, size_text
-from softgrasp.fem.run.motion import Profile
-from softgrasp.fem.scene.table import read_csv
-from softgrasp.fem.scene.text import out_of_range, read_text
-from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.reduction.certified.motion import FINER, Drive, Materials
+from softgrasp.fem import Profile, SceneError, free_memory, out_of_range, read_csv, read_text, shortened, size_text
+from softgrasp.reduction import CertifiedModel, Drive, Materials
+from softgrasp.reduction.certified.motion import FINER
 
 KEYS = ("lambda", "mu", "rho")
 ROUNDING = 1e-9  # of the time of a move

@@ -12,23 +12,15 @@ import h5py
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.fem.accuracy import adapt
-from softgrasp.fem.errors import SceneError, raise_on_all_ranks
-from softgrasp.fem.mesh.scene_hash import scene_keys
+from softgrasp.fem import SceneError, Trajectory, adapt, on_root, raise_on_all_ranks, scene_keys, simulate
 from softgrasp.fem.model.build import Model, Stopwatch, build
-from softgrasp.fem.petsc import on_root
-from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.file import load_scene, load_scene_collective, toml_value
-from softgrasp.reduction.certified.archive import load_certified
-from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.reduction.certified.motion import Drive, Materials
-from softgrasp.reduction.origin import MATERIAL, UNKNOWN, differing, origin_of
+from softgrasp.reduction import CertifiedModel, Drive, Materials, differing, load_certified, origin_of
+from softgrasp.reduction.origin import MATERIAL, UNKNOWN
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
 from softgrasp.study.query.page import box_text, compose, result_of
 from softgrasp.study.query.request import drive_of, materials_of, parse_settings, read_batch
-from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Session, list_files, show_warnings
+from softgrasp.study.shell import Session, folder_lock, list_files, show_warnings
 
 REFUSED = 3  # exit status
 

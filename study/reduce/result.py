@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from softgrasp.reduction.replay import FullRun
+from softgrasp.reduction import FullRun
 from softgrasp.study.forward.result import simulate_result
-from softgrasp.study.report.files import to_json
+from softgrasp.study.report import to_json
 from softgrasp.study.report.origin import peak_memory_mb
 
 KEPT = ("scene", "scene_hash", "version", "ranks", "machine", "n_s", "n_e", "states", "cells", "steps", "dt", "solver")

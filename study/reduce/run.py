@@ -7,12 +7,10 @@ from typing import Any, Unpack
 
 from rich.console import Console
 
-from softgrasp.fem.errors import SceneError
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import Scene, SceneError
 from softgrasp.study.reduce.linear import measure
 from softgrasp.study.reduce.linear.run import run_linear
-from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Flags, Session
+from softgrasp.study.shell import Flags, Session, folder_lock
 
 
 def check_scene(scene: Scene) -> tuple[str, ...]:

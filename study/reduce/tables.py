@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from softgrasp.study.reduce.times import FullTimes, Timed
-from softgrasp.study.report.tables import Columns
+from softgrasp.study.report import Columns
 
 
 def timed(p: Timed, full: FullTimes, **more: Any) -> dict[str, Any]:

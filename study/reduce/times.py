@@ -10,12 +10,10 @@ from typing import Protocol
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.run.simulate import RunOptions, simulate
-from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.study.report.tables import percent
-from softgrasp.study.shell.timing import RepeatableRun, processor_seconds
+from softgrasp.fem import Model, RunOptions, Stopwatch, Trajectory, simulate
+from softgrasp.reduction import FullRun, full_run
+from softgrasp.study.report import percent
+from softgrasp.study.shell import RepeatableRun, processor_seconds
 
 FULL_REPEATS = 3  # behind the median of the full run
 PATIENCE = 2.0  # seconds of a full run above which few are enough

@@ -9,8 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from softgrasp.fem.effects.damping import layered
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import Scene, layered
 
 PLAIN = (  # pattern of LaTeX, what a terminal shows
     (r"\\ddot (\w(_\w)?)", r"\1''"), (r"\\dot (\w(_\w)?)", r"\1'"), (r"\^\\top", "'"), (r"\\text|[\\${}]", ""),

@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.owned import note
-from softgrasp.fem.scene.file import resolved_toml
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import Scene, note, resolved_toml
 
 
 def to_json(value: Any) -> Any:

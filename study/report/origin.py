@@ -14,9 +14,7 @@ from mpi4py import MPI
 from slepc4py import SLEPc
 
 from softgrasp import PACKAGE, package_version
-from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.petsc import PETSc
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import PETSc, Scene, scene_hash
 
 
 def peak_memory_mb(comm: MPI.Intracomm) -> float:

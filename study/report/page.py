@@ -15,9 +15,7 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
-from softgrasp.fem.owned import note
-from softgrasp.fem.scene.file import resolved_toml
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import Scene, note, resolved_toml
 from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.origin import made_with
 from softgrasp.study.report.typeset import equation_html

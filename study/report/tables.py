@@ -15,8 +15,7 @@ import rich.table
 from rich.console import Console
 from rich.markup import escape
 
-from softgrasp.fem.mesh.check import counted
-from softgrasp.fem.owned import note
+from softgrasp.fem import counted, note
 from softgrasp.study.report.page import NUMBERS, Section, cell_text
 
 Columns = Mapping[str, str | Callable[[Any], Any]]

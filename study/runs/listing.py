@@ -13,15 +13,11 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from softgrasp.fem.errors import SceneError, no_pipe
-from softgrasp.fem.mesh.check import counted
-from softgrasp.fem.scene.text import LARGEST, parse_toml, read_text
-from softgrasp.study.report.files import write_json
+from softgrasp.fem import SceneError, counted, no_pipe, parse_toml, read_text
+from softgrasp.fem.scene.text import LARGEST
+from softgrasp.study.report import Section, Table, write_json, write_report
 from softgrasp.study.report.origin import command_line
-from softgrasp.study.report.page import Section, write_report
-from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.folder import claim, folder_lock, read_result
-from softgrasp.study.shell.session import list_files
+from softgrasp.study.shell import claim, folder_lock, list_files, read_result
 
 SHOWN = 30  # rows of numbers in a terminal; the CSV has all
 ALIKE = 1e-12  # relative difference below which two numbers count as equal: rounding

@@ -8,8 +8,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from softgrasp.study.pictures.style import BLUE, COLUMN, CYCLE, OUTLINE, colour_map, few_ticks, paper_style, save
-from softgrasp.study.report.tables import Table
+from softgrasp.study.pictures import BLUE, COLUMN, CYCLE, OUTLINE, colour_map, few_ticks, paper_style, save
+from softgrasp.study.report import Table
 from softgrasp.study.runs.sweep import SweepAxis, SweepPoint, axis_label
 
 BARS = 16  # numbers that a picture of two runs shows: the largest changes

@@ -10,13 +10,11 @@ from typing import Any
 from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem import SceneError
+from softgrasp.study.report import SHOWN, Section, Table
 from softgrasp.study.report.origin import origin
-from softgrasp.study.report.page import SHOWN, Section
-from softgrasp.study.report.tables import Table
 from softgrasp.study.runs.sweep import METHOD, Sweep, SweepPoint, axis_label, parse_axes, run_sweep_points
-from softgrasp.study.shell.folder import folder_lock
-from softgrasp.study.shell.session import Page, Session
+from softgrasp.study.shell import Page, Session, folder_lock
 
 UNITS = {"energy_drift": "energy drift", "seconds": "time [s]"}
 COARSE = 0.1  # error of the deformation above which a reduced sweep is warned of

@@ -7,11 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from softgrasp.fem.errors import SceneError
-from softgrasp.fem.scene.file import load_scene
-from softgrasp.fem.scene.materials import LIBRARY
-from softgrasp.fem.scene.scene import scene_schema
-from softgrasp.study.report.tables import Table
+from softgrasp.fem import LIBRARY, SceneError, load_scene, scene_schema
+from softgrasp.study.report import Table
 
 SCHEMA = "scene.schema.json"
 SCENE = """\

@@ -16,20 +16,12 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp import package_version
-from softgrasp.fem.accuracy import adapt
+from softgrasp.fem import Model, RunOptions, Scene, Trajectory, adapt, note, remove_own, scene_hash, simulate
 from softgrasp.fem.errors import Interrupted, SceneError, SoftgraspError, shortened
 from softgrasp.fem.labelled import table
-from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.owned import note, remove_own
-from softgrasp.fem.run.simulate import RunOptions, simulate
-from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.file import find_scene, load_scene, unit_of
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.shown import Card, Shown, listed
-from softgrasp.reduction.model import ReducedModel
-from softgrasp.reduction.reduce import reduce_linear
-from softgrasp.reduction.replay import errors_linear, full_run, replay_linear
+from softgrasp.reduction import ReducedModel, errors_linear, full_run, reduce_linear, replay_linear
 
 METHOD = "craig_bampton"  # needs no snapshots of the other values, and is stable at all of them
 MOST = 100_000  # points: each is a run

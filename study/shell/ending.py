@@ -11,10 +11,11 @@ from collections.abc import Callable, Sequence
 from rich.console import Console
 from rich.text import Text
 
-from softgrasp.fem.errors import SceneError, SoftgraspError, one_line
+from softgrasp.fem import SceneError, SoftgraspError, one_line
 from softgrasp.study.shell.streams import outlive_readers, write_utf8
 
 RANK = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK")  # set by launchers, known before MPI is loaded
+PREFIXES = "docs/guide/petsc.md"
 PIPED = 120  # letters of a line that no terminal shows
 
 
@@ -64,6 +65,22 @@ def no_compiler(error: BaseException) -> str:
     return ""
 
 
+def name_unused_options() -> None:
+    """Warn of PETSc options for this program that no solver read, and keep PETSc from listing them again."""
+    petsc = sys.modules.get("petsc4py.PETSc")
+    if petsc is None:
+        return
+    options = petsc.Options()
+    unused = [name for name in options.getAll() if name.startswith("softgrasp_") and not options.used(name)]
+    for name in unused:
+        options.hasName(name)  # marks it as used
+    if unused and rank() == 0:
+        names = ", ".join(f"-{name}" for name in unused)
+        sys.stderr.write(
+            f"warning: no solver of this command read {names} of PETSC_OPTIONS; {PREFIXES} lists the prefixes\n"
+        )
+
+
 def run_command(command: Callable[[], object]) -> None:
     """Run a command line to its end. Collective."""
     outlive_readers()
@@ -90,3 +107,5 @@ def run_command(command: Callable[[], object]) -> None:
         traceback.print_exc()
         end_all()
         sys.exit(2)
+    finally:
+        name_unused_options()

@@ -8,20 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from softgrasp.fem.errors import SceneError
-from softgrasp.fem.owned import (
-    LIST,
-    LOCK,
-    begin_list,
-    forget,
-    hold,
-    own_files,
-    read_list,
-    release,
-    remove_own,
-    set_aside,
-)
-from softgrasp.fem.scene.text import read_text
+from softgrasp.fem import SceneError, read_text, remove_own
+from softgrasp.fem.owned import LIST, LOCK, begin_list, forget, hold, own_files, read_list, release, set_aside
 
 
 def default_folder(command: str, scene: Path) -> Path:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, get_origin
 
 import typer
 
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem import SceneError
 
 
 def parse_folder(text: str) -> Path:
@@ -43,7 +43,7 @@ def parse_tolerance(text: str | float) -> float:
 
 
 def _pdf(pdf: bool) -> bool:
-    from softgrasp.study.pictures import PDF
+    from softgrasp.study.pictures.pdf import PDF
 
     PDF.set(pdf)
     return pdf

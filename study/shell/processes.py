@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from softgrasp import PACKAGE
-from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem import SoftgraspError
 
 IN_MPI_JOB = ("PMI_RANK", "PMI_SIZE", "PMIX_RANK", "OMPI_COMM_WORLD_SIZE")
 

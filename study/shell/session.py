@@ -17,15 +17,10 @@ from rich.padding import Padding
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from softgrasp.fem.errors import raise_on_all_ranks
-from softgrasp.fem.model.build import Model, build
+from softgrasp.fem import Model, Scene, build, find_scene, load_scene_collective, raise_on_all_ranks
 from softgrasp.fem.owned import follow
-from softgrasp.fem.scene.file import find_scene, load_scene_collective
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.report.files import write_json, write_scene
+from softgrasp.study.report import Section, Table, show_sections, write_json, write_report, write_scene
 from softgrasp.study.report.origin import command_line
-from softgrasp.study.report.page import Section, write_report
-from softgrasp.study.report.tables import Table, show_sections
 from softgrasp.study.shell.folder import claim, files_of, read_result, remove_files
 
 

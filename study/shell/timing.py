@@ -12,10 +12,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.petsc import PETSc
-from softgrasp.fem.run.simulate import Run, RunOptions
-from softgrasp.fem.run.stepping import make_ts
+from softgrasp.fem import Model, PETSc, Run, RunOptions, make_ts
 
 
 def timed(comm: MPI.Intracomm, call: Callable[[], Any]) -> float:

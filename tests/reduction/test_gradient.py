@@ -10,6 +10,8 @@ import pytest
 
 import softgrasp as sg
 from softgrasp.reduction.galerkin import galerkin_system
+from softgrasp.reduction.gradient import sensitivities
+from softgrasp.reduction.online import run
 from softgrasp.reduction.system import ModelError
 
 pytestmark = pytest.mark.serial
@@ -107,3 +109,35 @@ def test_what_does_not_fit_is_refused(case: tuple[Any, dict[str, Any]]) -> None:
         sg.gradient(rom, lambda y: (0.0, np.zeros(2)), **given)
     with pytest.raises(ModelError, match="give either the force"):
         sg.gradient(rom, lambda y: (0.0, y), given["dt"])
+
+
+def test_sensitivities_are_the_gradients_of_the_adjoint(case: tuple[Any, dict[str, Any]]) -> None:
+    rom, arguments = case
+    given = {key: arguments[key] for key in ("dt", "force", "hand")}
+    system, driven = rom.at(), given["force"] is None
+    answer = run(system, **given)
+    weight = np.random.default_rng(1).standard_normal(answer.outputs.shape)
+    found = sg.gradient(rom, lambda y: ((weight * y).sum(), weight), **given)
+    m = rom.materials[-1]
+    keys = ("lam", "mu", "rho")
+    others = [rom.at((*rom.materials[:-1], replace(m, **{key: 2 * getattr(m, key)}))) for key in keys]
+    slopes = sensitivities(system, others, answer, driven=driven)
+    for key, slope in zip(keys, slopes, strict=True):
+        exact = getattr(m, key) * getattr(found, key)[-1]
+        assert (weight * slope).sum() == pytest.approx(exact, rel=1e-8)  # rounding: two ways through 60 to 200 steps
+
+
+def test_sensitivities_follow_the_equilibrium_that_a_run_starts_in() -> None:
+    model = sg.build("layers_2d", ["time.steps=40"])
+    rom = sg.reduce(model, sg.simulate(model), "craig_bampton", N=20)
+    still = np.zeros((41, 2)), np.zeros((41, 2))
+
+    def at(share: float) -> tuple[Any, Any]:
+        system = rom.at(tuple(replace(m, mu=share * m.mu) for m in rom.materials))
+        return system, run(system, 0.025, hand=still, x0=system.equilibrium())
+
+    (system, answer), (other, _) = at(1.0), at(2.0)
+    (slope,) = sensitivities(system, [other], answer, driven=True)
+    difference = (at(1 + 1e-4)[1].outputs - at(1 - 1e-4)[1].outputs) / 2e-4
+    assert np.abs(slope - difference).max() < 1e-6 * np.abs(slope).max()  # 1e-8 of the step's square, and rounding
+    assert np.abs(slope).min(axis=0).max() > 0  # it sags from the start

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -26,9 +27,13 @@ def test_a_saved_model_becomes_c(tmp_path: Path) -> None:
     model = sg.build("paper_forward", SMALL)
     run, file, folder = sg.simulate(model), tmp_path / "rom.h5", tmp_path / "plant"
     sg.save(sg.reduce(model, run, "craig_bampton", N=10), file)
-    with pytest.raises(SceneError, match="name what to write: --c FOLDER"):
+    with pytest.raises(SceneError, match="name what to write: --c FOLDER or --fmu FILE"):
         export(file)
-    output = export(file, "--c", folder, "--tick", 2e-3)
+    with pytest.raises(SceneError, match=r"name it plant\.fmu"):
+        export(file, "--c", folder, "--fmu", tmp_path / "plant.zip")
+    assert not folder.exists()
+    output = export(file, "--c", folder, "--fmu", tmp_path / "plant.fmu", "--tick", 2e-3)
+    assert zipfile.is_zipfile(tmp_path / "plant.fmu")
     assert "craig_bampton, N = 10, a tick of 0.002 s" in output
     assert "warning" not in output
     assert {"Makefile", "golden.log", "plant.c", "plant.h", "plant_data.h"} < {path.name for path in folder.iterdir()}

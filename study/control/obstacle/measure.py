@@ -5,15 +5,11 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import Stopwatch
-from softgrasp.fem.petsc import on_root
+from softgrasp.fem import Stopwatch, on_root
+from softgrasp.lqr import Design, Notify, Plan, plan_control, quadratic_program
 from softgrasp.lqr.constrained.least_distance import nearest
-from softgrasp.lqr.constrained.plan import Plan, quadratic_program
-from softgrasp.lqr.design.constrained import plan_control
-from softgrasp.lqr.design.feedback import Design
-from softgrasp.lqr.design.orders import Notify
 from softgrasp.study.control.obstacle.result import PlannedStudy
-from softgrasp.study.shell.timing import repeated
+from softgrasp.study.shell import repeated
 
 SOLUTIONS = 10  # of the quadratic program, behind its times
 

@@ -11,12 +11,10 @@ from matplotlib.collections import LineCollection
 from matplotlib.patheffects import withStroke
 from scipy.spatial import cKDTree
 
-from softgrasp.fem.columns import AXES
-from softgrasp.fem.fields.picture import PictureMesh
-from softgrasp.lqr.design.constrained import PlannedControl
+from softgrasp.fem import AXES, PictureMesh
+from softgrasp.lqr import PlannedControl
 from softgrasp.study.control.obstacle.result import PlannedStudy
-from softgrasp.study.pictures import style
-from softgrasp.study.pictures.obstacles import draw_obstacle
+from softgrasp.study.pictures import draw_obstacle, style
 
 SHOWN = (0.0, 0.12, 0.28, 0.45, 0.62, 0.8, 1.0)  # shares of the way at which the body is drawn
 MANY = 2000  # points of a line; in print more of them coincide

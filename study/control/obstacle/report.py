@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.columns import AXES
-from softgrasp.lqr.constrained.plan import Plan
+from softgrasp.fem import AXES
+from softgrasp.lqr import Plan
 from softgrasp.study.control.obstacle.result import PlannedStudy
-from softgrasp.study.report.page import Section, captioned
-from softgrasp.study.report.tables import Table, listed
+from softgrasp.study.report import Section, Table, captioned, listed
 
 CAPTIONS = {
     "obstacle.png": "The boundary of the body on the full plant under the plan, and the way of its middle; grey and "

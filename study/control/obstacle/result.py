@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.lqr.design.constrained import PlannedControl
+from softgrasp.lqr import PlannedControl
 
 
 @dataclass(frozen=True)

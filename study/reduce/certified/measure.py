@@ -9,12 +9,10 @@ from statistics import median
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.reduction.certified.validation import TestError, measured_error
-from softgrasp.reduction.parameters import run_at
+from softgrasp.fem import Model, Stopwatch
+from softgrasp.reduction import CertifiedModel, TestError, measured_error, run_at
 from softgrasp.study.reduce.certified.result import BoxCheck, Size
-from softgrasp.study.shell.timing import median_seconds
+from softgrasp.study.shell import median_seconds
 
 REPEATS = 7  # behind the median time of a query
 TESTS, FEWER, LARGE = 5, 3, 20_000  # tests of each constant, and from so many unknowns on

@@ -8,14 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.reduction.certified.certificate import NORMS
+from softgrasp.reduction import NORMS, CertifiedModel, Validation
 from softgrasp.reduction.certified.greedy import REASONS
-from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.reduction.certified.trainer import Validation
 from softgrasp.study.reduce.certified.result import BoxCheck
-from softgrasp.study.report.page import Section, captioned
-from softgrasp.study.report.tables import Columns, Table, percent, table_of
-from softgrasp.study.shell.session import Page
+from softgrasp.study.report import Columns, Section, Table, captioned, percent, table_of
+from softgrasp.study.shell import Page
 
 CAPTIONS = {
     "certified_box.png": "Error of the reduction over the box, relative to the largest energy norm of the deformation: "

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
-from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.study.pictures.style import BLUE, COLUMN, GREEN, HAND, ORANGE, UNSTABLE, few_ticks, paper_style, save
+from softgrasp.reduction import CertifiedModel
+from softgrasp.study.pictures import BLUE, COLUMN, GREEN, HAND, ORANGE, UNSTABLE, few_ticks, paper_style, save
 from softgrasp.study.reduce.certified.result import BoxCheck, Size
-from softgrasp.study.report.tables import percent
+from softgrasp.study.report import percent
 
 KINDS = (
     ("bound", "bound (proved)", BLUE, "o"),

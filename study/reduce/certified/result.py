@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from softgrasp.reduction.certified.validation import TestError
+from softgrasp.reduction import TestError
 
 
 @dataclass(frozen=True)

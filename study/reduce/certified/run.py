@@ -11,13 +11,8 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress, TaskProgressColumn
 
-from softgrasp.fem.errors import SoftgraspError
-from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.certified.archive import load_certified, save_certified
-from softgrasp.reduction.certified.greedy import Greedy
-from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.reduction.certified.motion import Materials
+from softgrasp.fem import Model, Scene, SoftgraspError, Stopwatch
+from softgrasp.reduction import CertifiedModel, Greedy, Materials, ModelError, load_certified, run_at, save_certified
 from softgrasp.reduction.certified.trainer import (
     PLACES,
     SHARE,
@@ -28,14 +23,11 @@ from softgrasp.reduction.certified.trainer import (
     train_key,
     validate,
 )
-from softgrasp.reduction.parameters import run_at
-from softgrasp.reduction.system import ModelError
 from softgrasp.study.reduce.certified.measure import REPEATS, check_box
 from softgrasp.study.reduce.certified.page import compose, shown
 from softgrasp.study.reduce.certified.result import BoxCheck
 from softgrasp.study.reduce.result import reduce_result
-from softgrasp.study.shell.session import Page, Session
-from softgrasp.study.shell.timing import median_seconds
+from softgrasp.study.shell import Page, Session, median_seconds
 
 FILE = "certified.h5"
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from softgrasp.study.reduce.linear.result import COMPARED, MethodSweep
-from softgrasp.study.report.tables import percent
+from softgrasp.study.report import percent
 
 
 def findings(sweeps: Sequence[MethodSweep]) -> tuple[str, ...]:

@@ -10,19 +10,12 @@ from functools import partial
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.scene.control import Reduction
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.bases import registry
-from softgrasp.reduction.bases.basis import Basis
+from softgrasp.fem import Reduction, Scene
+from softgrasp.reduction import Basis, ModelComparison, ModelError, ReducedModel, Truncation, project_scene, registry
 from softgrasp.reduction.bases.states import BasisError, States, states_of
-from softgrasp.reduction.bases.truncation import Truncation
-from softgrasp.reduction.errors import ModelComparison
-from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
-from softgrasp.reduction.reduce import project_scene
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
-from softgrasp.reduction.system import ModelError
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
     LARGER,
@@ -38,7 +31,7 @@ from softgrasp.study.reduce.linear.result import (
     timed_points,
 )
 from softgrasp.study.reduce.times import FullTimes, Say, Turns, in_turn
-from softgrasp.study.shell.timing import median_processor_seconds
+from softgrasp.study.shell import median_processor_seconds
 
 FURTHER = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
 REPEATS, SETUPS = 9, 5  # behind each median of the online time and of the set-up

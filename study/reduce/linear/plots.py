@@ -15,11 +15,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from softgrasp.reduction.bases.registry import PAPER_METHODS
-from softgrasp.study.pictures import style
-from softgrasp.study.pictures.animation import film, gif_bytes, timing, write_gif
+from softgrasp.reduction import PAPER_METHODS
+from softgrasp.study.pictures import film, gif_bytes, hands_at, style, timing, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, outline
-from softgrasp.study.pictures.shapes import hands_at
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, by_error, unbeaten
 from softgrasp.study.reduce.linear.views import Views
 

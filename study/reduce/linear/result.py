@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.reduction.bases.registry import Method
-from softgrasp.reduction.model import ReducedModel
-from softgrasp.reduction.replay import FullRun
+from softgrasp.reduction import FullRun, Method, ReducedModel
 from softgrasp.study.reduce.result import reduce_result
 from softgrasp.study.reduce.times import FullTimes, Turns
 

@@ -7,18 +7,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from softgrasp.fem.model.build import Stopwatch
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import Scene, Stopwatch
+from softgrasp.reduction import FullRun
 from softgrasp.reduction.archive import save
-from softgrasp.reduction.replay import FullRun
-from softgrasp.study.pictures.background import draw_in_background
+from softgrasp.study.pictures import draw_in_background
 from softgrasp.study.reduce.linear import measure
 from softgrasp.study.reduce.linear.findings import findings
 from softgrasp.study.reduce.linear.page import compose
 from softgrasp.study.reduce.linear.result import MethodSweep, ReductionStudy, best
 from softgrasp.study.reduce.linear.views import gather_views
 from softgrasp.study.reduce.times import FullTimes, measured_run
-from softgrasp.study.shell.session import Session
+from softgrasp.study.shell import Session
 
 
 def run_linear(session: Session, scene: Scene, names: Sequence[str]) -> dict[str, Any]:

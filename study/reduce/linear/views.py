@@ -7,13 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softgrasp.fem.fields.picture import PictureMesh, gather_picture, vertex_displacement
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.petsc import Array
-from softgrasp.reduction.bases.registry import PAPER_METHODS
-from softgrasp.reduction.model import ReducedModel
-from softgrasp.reduction.parameters import thinned
-from softgrasp.reduction.replay import FullRun, replay_linear
+from softgrasp.fem import Array, Model, PictureMesh, gather_picture, vertex_displacement
+from softgrasp.reduction import PAPER_METHODS, FullRun, ReducedModel, replay_linear, thinned
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, by_error, nearest
 
 MODES = 4  # a method

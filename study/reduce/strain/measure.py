@@ -9,13 +9,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import qmc
 
-from softgrasp.fem.errors import SceneError, SolverError, shortened
-from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.run.simulate import simulate
-from softgrasp.reduction.bases.basis import ReductionError
+from softgrasp.fem import Model, SceneError, SolverError, Stopwatch, shortened, simulate
+from softgrasp.reduction import FullRun, ReductionError, StrainModel, full_run
 from softgrasp.reduction.parameters import grid_of, mirrored, moved_to, outside, run_at, training_of
-from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.reduction.strain.model import StrainModel
 from softgrasp.reduction.strain.training import Reference, Training, pooled_errors, reference_of, replay_strain, train
 from softgrasp.study.reduce.strain.result import (
     CELLS_AT,
@@ -26,7 +22,7 @@ from softgrasp.study.reduce.strain.result import (
     most_accurate,
 )
 from softgrasp.study.reduce.times import FullTimes, Say, Turns, in_turn
-from softgrasp.study.shell.timing import median_processor_seconds
+from softgrasp.study.shell import median_processor_seconds
 
 SIZES = (8, 10, 14, 18, 24, 30)  # N unless the scene names some: each more displacement costs cells too
 TAUS = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4)

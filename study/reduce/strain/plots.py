@@ -12,10 +12,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LogNorm
 
-from softgrasp.fem.fields.picture import PictureMesh
-from softgrasp.reduction.strain.model import StrainModel
-from softgrasp.study.pictures import style
-from softgrasp.study.pictures.shapes import hand_polygons, seen, shadow
+from softgrasp.fem import PictureMesh
+from softgrasp.reduction import StrainModel
+from softgrasp.study.pictures import hand_polygons, seen, shadow, style
 from softgrasp.study.reduce.strain.result import CELLS_AT, StrainPoint, StrainStudy
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from softgrasp.reduction.replay import FullRun
-from softgrasp.reduction.strain.model import StrainModel, TrainingDomain
+from softgrasp.reduction import FullRun, StrainModel, TrainingDomain
 from softgrasp.study.reduce.times import FullTimes, Turns
 
 CELLS_AT = (14, 24)  # N at which tau is varied

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from softgrasp.fem.errors import SceneError
-from softgrasp.fem.model.build import Stopwatch
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem import Scene, SceneError, Stopwatch
 from softgrasp.reduction.archive import save
 from softgrasp.study.reduce.result import reduce_result
 from softgrasp.study.reduce.strain.measure import measure_strain
 from softgrasp.study.reduce.strain.page import compose, sentences
 from softgrasp.study.reduce.strain.result import StrainFamily, StrainStudy
 from softgrasp.study.reduce.times import measured_run
-from softgrasp.study.shell.session import Page, Session
+from softgrasp.study.shell import Page, Session
 
 
 def run_strain(session: Session, scene: Scene) -> dict[str, Any]:

@@ -168,6 +168,7 @@ def test_restart_in_contact_repeats_the_bits(overrides: list[str], mpi_tmp_path:
     for name in ("force", "impulse", "gap", "touching"):
         assert np.array_equal(getattr(again.contact, name), getattr(whole.contact, name))
     assert again.energy_drift == whole.energy_drift
+    assert again.contact.touch == whole.contact.touch
 
 
 @pytest.mark.ranks(3)
@@ -207,6 +208,24 @@ REFUSED = [
     ([TABLE, ON, "effects.finite_strain={}"], "effects.obstacles cannot go with effects.finite_strain"),
     ([TABLE, ON, "tissue.refine={tolerance=0.1}"], "tissue.refine.tolerance cannot go with effects.obstacles"),
 ]
+
+
+@pytest.mark.ranks(2)
+@pytest.mark.parametrize("overrides", [[SLANTED, BETA], [TABLE, SPACE, *TWO]])
+def test_compiled_half_spaces_are_those_of_the_general_step(
+    overrides: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled = run(*overrides)
+    monkeypatch.setattr("softgrasp.fem.run.contact_step.contact_library", lambda: None)
+    general = run(*overrides)
+    assert general.contact.rounds >= compiled.contact.rounds > 0
+    # two orders of the same sums, over 300 steps in which nodes touch and leave
+    assert np.abs(compiled.final - general.final).max() < 1e-9 * np.abs(general.final).max()
+    assert compiled.contact.stopped == pytest.approx(general.contact.stopped, rel=1e-9)
+    assert compiled.contact.touch == pytest.approx(general.contact.touch, rel=1e-9, abs=1e-15)
+    assert np.array_equal(compiled.contact.touching, general.contact.touching)
+    scale = np.abs(general.force).max()
+    assert np.abs(compiled.force - general.force).max() <= 1e-6 * scale  # impulses over dt: sums that cancel
 
 
 @pytest.mark.parametrize(("overrides", "words"), REFUSED)

@@ -11,60 +11,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
-import softgrasp as sg
 from softgrasp.fem.errors import ResourceError
 from softgrasp.reduction.export import write_c
-from softgrasp.reduction.export.affine import AffinePlant, affine_plant
-from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.export.affine import affine_plant
 from softgrasp.reduction.system import ModelError, UnstableModelError
-from tests.helpers.models import LAYERS, Array
-from tests.helpers.reduced import DAMPED, KINDS, model_of, reduced, symplectic_basis
+from tests.helpers.exported import MODELS, of_kind, state_matrices
+from tests.helpers.models import LAYERS
+from tests.helpers.reduced import DAMPED, KINDS
 
 pytestmark = [
     pytest.mark.serial,
     pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler cc here"),
 ]
-GRAVITY: dict[str, Any] = {"effects": {"gravity": {"g": [0.0, -9.81]}, "reaction": True}}
-
-
-def rom(*changes: dict[str, Any]) -> ReducedModel:
-    model = model_of(MPI.COMM_SELF, *changes)
-    return sg.reduce(model, sg.simulate(model), "craig_bampton", N=14)
-
-
-def of_kind(kind: tuple[Any, Any, bool], *changes: dict[str, Any]) -> ReducedModel:
-    """A model of smooth shapes, stable by its structure."""
-    coordinates, frame, fixed = kind
-    model = model_of(MPI.COMM_SELF, *changes)
-    return reduced(model, symplectic_basis(model.system.layout, 4, frame, fixed, coordinates, lift=coordinates == "qv"))
-
-
-MODELS = {
-    "gravity": lambda: rom(DAMPED, GRAVITY),
-    "undamped": lambda: rom({}),
-    "layers": lambda: rom(DAMPED, {"tissue": {"layers": LAYERS}}),
-    "viscosity in E": lambda: of_kind(("qp", "absolute", False), DAMPED),
-}
 
 
 def make(folder: Path, *targets: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["make", "-C", str(folder), *targets], capture_output=True, text=True, timeout=120)
-
-
-def state_matrices(plant: AffinePlant, theta: Array) -> tuple[Array, Array]:
-    """E and A of the sums, (N, N)."""
-    E = np.eye(plant.N) if plant.E_0 is None else plant.E_0.copy()
-    A = plant.A_0.copy()
-    for i, (mu, lam, beta) in enumerate(theta):
-        A += mu * plant.A_mu[i] + lam * plant.A_lambda[i]
-        viscous = beta * (mu * plant.beta_mu[i] + lam * plant.beta_lambda[i])
-        if plant.E_0 is None:
-            A += viscous
-        else:
-            E += viscous
-    return E, A
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -95,7 +58,7 @@ def test_c_takes_our_own_steps(name: str, tmp_path: Path) -> None:
 
 def test_the_test_finds_a_wrong_digit(tmp_path: Path) -> None:
     """A number that is off by 1e-9 of itself, and a log without its end."""
-    write_c(rom(DAMPED, GRAVITY), tmp_path)
+    write_c(MODELS["gravity"](), tmp_path)
     data, log = tmp_path / "plant_data.h", tmp_path / "golden.log"
 
     def replayed() -> int:
@@ -114,14 +77,14 @@ def test_the_test_finds_a_wrong_digit(tmp_path: Path) -> None:
 
 def test_nothing_is_called(tmp_path: Path) -> None:
     """No allocation, no output, no mathematical library: the object needs memcpy and its like at most."""
-    write_c(rom(DAMPED), tmp_path)
+    write_c(MODELS["gravity"](), tmp_path)
     subprocess.run(["cc", "-std=c99", "-O3", "-c", "plant.c"], cwd=tmp_path, check=True)
     names = subprocess.run(["nm", "-u", "plant.o"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
     assert set(names.split()) <= {"U", "memcpy", "memset", "__stack_chk_fail", "_GLOBAL_OFFSET_TABLE_"}
 
 
 def test_what_cannot_be_exported_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = rom(DAMPED)
+    model = MODELS["gravity"]()
     with pytest.raises(ModelError, match=r"tick = 0 s: the time step must be a positive number"):
         write_c(model, tmp_path / "plant", 0.0)
     with pytest.raises(UnstableModelError, match="unstable"):

@@ -6,6 +6,7 @@ import html
 import json
 import locale
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -229,3 +230,19 @@ def test_help_teaches() -> None:
     for words in ("Run a scene", "Reduce, control and study", "Examples", "Exit status", "3: an answer of query"):
         assert words in shown.stdout
     assert shown.stdout.index("Examples") < shown.stdout.index("softgrasp sweep my.toml") < shown.stdout.index("Exit")
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_petsc_options_are_read_and_one_that_is_not_is_named(
+    tmp_path: Path, ranks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (ROOT / "docs" / "guide" / "petsc.md").read_text()
+    options = re.findall(r'^export PETSC_OPTIONS="(.*)"$', page, re.MULTILINE)[0]
+    monkeypatch.setenv("PETSC_OPTIONS", f"{options} -softgrasp_midpont_ksp_view")
+    args = ("simulate", str(FORWARD), "--set", "time.steps=40", "--no-pictures", "--out", str(tmp_path))
+    run = softgrasp(*args, ranks=ranks)
+    assert run.returncode == 0
+    assert re.search(r"KSP Object: .*\(softgrasp_midpoint_\)", run.stdout)
+    assert re.search(r"PC Object: .*\(softgrasp_midpoint_\).*\n *type: lu", run.stdout)
+    assert run.stderr.count("no solver of this command read -softgrasp_midpont_ksp_view of PETSC_OPTIONS;") == 1
+    assert "WARNING!" not in run.stdout + run.stderr

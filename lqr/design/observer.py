@@ -1,0 +1,127 @@
+"""The observer of a scene: sensors, the filter that runs, and its judgement on the full plant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.model.build import Stopwatch
+from softgrasp.fem.petsc import Array, on_root
+from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.design.scene import control_of
+from softgrasp.lqr.loop.controller import Controller, layout_hash
+from softgrasp.lqr.observer.full import FullFilter, full_filter
+from softgrasp.lqr.observer.judge import Judged, Ticks, abscissa_without, judge, make_ticks
+from softgrasp.lqr.observer.reduced import ReducedFilter, reduced_filter
+from softgrasp.lqr.observer.sensors import Noise, Sensors, make_disturbance, make_sensors
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
+
+WEIGHTS = (1.0, 10.0, 100.0)  # of the noise that stands for what the filter leaves out, until the full loop is stable
+ONE_BY_ONE = 8  # markers up to which the loop without each is examined, a spectrum of the full plant
+
+
+@dataclass(frozen=True)
+class ObservedControl:
+    """What a scene's ``[control.observer]`` asks for."""
+
+    controller: Controller
+    """Optimal gain on the estimate, with its filter."""
+    sensors: Sensors
+    """Samples of a tick."""
+    reduced: ReducedFilter
+    """The filter with the plant and the noise that it was made for."""
+    weight: float
+    """Factor of the noise that stands for what the filter leaves out, the least with which the full loop is stable."""
+    judged: Judged
+    """Full plant, filter and gain."""
+    without: dict[str, float]
+    """Abscissa of the whole loop where a marker, or all samples but those of the hand, never arrive [1/s]."""
+    full: FullFilter | None
+    """Kalman filter of the full tissue from the markers; None without markers."""
+    sd_full: Array | None
+    """Standard deviation of the outputs, relative to the hand, by the full filter [m, rad], (o,)."""
+    loop: ModalLoop
+    """All modes of the plant."""
+
+
+def observe(design: Design, watch: Stopwatch) -> ObservedControl:
+    """Filter, controller and judgement of a scene. Collective.
+
+    The gain is the optimal one on states of the filter's form. Where the full loop is not stable, the filter trusts the
+    markers less, see :data:`WEIGHTS`.
+
+    Args:
+        design: the optimal feedback of the scene.
+        watch: records the seconds of "full filter" and "observer".
+
+    Raises:
+        ControlError: the plant has no observer, or none that leaves the full plant stable.
+        SolverError: the dual Riccati equation did not converge.
+    """
+    problem, given, loop_of = design.problem, control_of(design.model).observer, control_of(design.model).loop
+    assert given is not None
+    _check(design)
+    noise = Noise(given.noise.pose, given.noise.speed, given.noise.marker, given.noise.force)
+    sensors = make_sensors(problem, given.markers, noise)
+    acting = given.disturbance
+    disturbance = make_disturbance(problem, acting.hand, acting.load, acting.box)
+    period = 1 / loop_of.rate
+    full, sd_full = None, None
+    if given.markers:
+        with watch.stage("full filter"):
+            full = full_filter(problem, sensors, disturbance, period)
+            sd_full = full.sd_of(problem, problem.C_z)
+    with watch.stage("observer"):
+        loop = ModalLoop(problem, DENSE_LIMIT)
+        ticks = make_ticks(problem, loop, sensors, disturbance, period)
+        for weight in WEIGHTS:
+            reduced = reduced_filter(problem, loop.plant, sensors, disturbance, given.N, period, given.delay, weight)
+            controller = _controller(design, reduced, period)
+            judged = judge(problem, design.solution, loop, ticks, disturbance, controller)
+            if judged.stable:
+                break
+        else:
+            raise ControlError(
+                f"no observer of {given.N} states leaves the full plant stable, the last one has the abscissa "
+                f"{judged.abscissa:.3g}/s; raise control.observer.N, or lower control.Q for a slower loop"
+            )
+        without = on_root(problem.layout.comm, lambda: _without(ticks, controller, sensors))
+    return ObservedControl(controller, sensors, reduced, weight, judged, without, full, sd_full, loop)
+
+
+def _check(design: Design) -> None:
+    """Raises ControlError: the scene has no observer."""
+    layout, loop = design.problem.layout, control_of(design.model).loop
+    if layout.n_e > DENSE_LIMIT:
+        raise ControlError(
+            f"an observer is checked with all modes of the plant, at most {DENSE_LIMIT}; this scene has {layout.n_e}: "
+            "take a coarser mesh"
+        )
+    if design.modal:
+        raise ControlError("an observer takes the optimal gain of the whole plant; leave out control.method = 'modal'")
+    if loop.delay:
+        raise ControlError("control.loop.delay and an observer exclude each other; give control.observer.delay instead")
+
+
+def _controller(design: Design, reduced: ReducedFilter, period: float) -> Controller:
+    """The optimal gain on the states of a filter. Collective."""
+    problem, scene, plant = design.problem, design.model.scene, reduced.plant
+    x_bar, u_bar = plant.rest_at(design.target.state.q_s)
+    return Controller(
+        reduced.shapes.reduce_gain(problem, design.gain), x_bar, u_bar, plant, period,
+        design.actuation.bound(problem.layout.n_s), scene_hash(scene), layout_hash(problem.layout),
+        {"scene": scene.name, "method": "optimal gain on an estimate", "N": plant.N}, reduced.filter,
+    )  # fmt: skip
+
+
+def _without(ticks: Ticks, controller: Controller, sensors: Sensors) -> dict[str, float]:
+    """Abscissa where one marker, or all samples but those of the hand, never come. Not collective."""
+    index, count = np.arange(len(sensors.sd)), len(sensors.nodes)
+    groups = {"all but the hand": index >= sensors.markers.start}
+    if 1 < count <= ONE_BY_ONE:
+        each = np.split(index[sensors.markers], count)
+        groups |= {f"marker {i + 1}": np.isin(index, rows) for i, rows in enumerate(each)}
+    return {name: abscissa_without(ticks, controller, lost) for name, lost in groups.items()}

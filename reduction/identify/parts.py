@@ -1,0 +1,92 @@
+"""Errors of the reduced outputs over time by their causes, and what mends those of mesh and time step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.accuracy.adapt import estimated
+from softgrasp.fem.errors import MeshError, ResourceError, SceneError
+from softgrasp.fem.model.build import MeshEstimate
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.reduction.identify.near import Experiment, Near
+from softgrasp.reduction.online import ReducedTrajectory
+
+STEP_SHARE = 4 / 3  # error of a midpoint step over its difference to half the step
+MARGIN = 0.5  # of what the error of mesh or step may be to stay below the noise
+LARGE = 0.1  # error of the outputs above which parts of the error are no small changes, and say little about a goal
+COARSEST, FINEST = 1e-2, 1e-5  # tolerances that a refinement can take
+
+
+def errors_of_outputs(
+    near: Near, values: Array, answers: Sequence[ReducedTrajectory], experiments: Sequence[Experiment]
+) -> tuple[dict[str, list[Array] | None], MeshEstimate | None]:
+    """Truth less reduced outputs of each experiment by cause, (steps + 1, outputs), and the estimate. Collective.
+
+    The part of the reduction is measured by a full run at the values, those of mesh and time step are estimates; that
+    of the mesh is None where there is none.
+    """
+    full, small = near.full(values), near.system(values)
+    estimates: dict[int, MeshEstimate] = {}
+    runs: dict[int, Array] = {}
+    found: dict[str, list[Array] | None] = {"mesh": [], "time step": [], "reduction": []}
+    for i, (e, answer) in enumerate(zip(experiments, answers, strict=True)):
+        same = i if e.data.hand is not None else -1  # all others have the motion of the scene
+        if same not in runs:
+            model = replace(full, scene=e.scene)
+            runs[same] = simulate(model).outputs
+            try:
+                estimates[same] = estimated(model)
+            except (SceneError, MeshError, ResourceError):  # no finer mesh can be made
+                found["mesh"] = None
+        halved = near.run(small, e, refined=2).outputs[::2]
+        for name, part in (
+            ("mesh", estimates[same].delta if same in estimates else None),
+            ("time step", STEP_SHARE * (halved - answer.outputs)),
+            ("reduction", runs[same] - answer.outputs),
+        ):
+            kept = found[name]
+            if kept is not None and part is not None:
+                kept.append(part)
+    return found, next(iter(estimates.values()), None)
+
+
+def finer_tolerance(mesh: Array, noise: Array, estimate: MeshEstimate) -> float:
+    """Tolerance of a mesh whose part stays below the noise, of one digit; the first one for a mesh of large errors."""
+    if estimate.estimate > LARGE:
+        return COARSEST
+    goal = MARGIN * estimate.estimate / float((np.abs(mesh) / noise).max())
+    goal = min(max(goal, FINEST), COARSEST)
+    power = 10.0 ** np.floor(np.log10(goal) + 1e-9)
+    return float(f"{np.floor(goal / power + 1e-9) * power:.0e}")
+
+
+def finer_steps(step: Array, noise: Array, steps: int) -> int:
+    """Time steps whose part stays below the noise, which falls with their square; of two digits."""
+    goal = steps * float((np.abs(step) / noise).max() / MARGIN) ** 0.5
+    power = 10.0 ** (np.floor(np.log10(goal)) - 1)
+    return int(np.ceil(goal / power) * power)
+
+
+def finer_scene(scene: Scene, tolerance: float | None, steps: int | None, time_error: float) -> Scene:
+    """The scene with a tolerance of its mesh and the steps that carry it, or with more steps.
+
+    ``time_error``: estimated error of its own steps in the outputs, relative.
+    """
+    least = max(steps or 0, scene.time.steps)
+    if tolerance is not None and time_error > tolerance:
+        least = max(least, int(scene.time.steps * (2 * time_error / tolerance) ** 0.5) + 1)
+
+    def edit(table: dict[str, Any]) -> None:
+        table["time"]["steps"] = least
+        if tolerance is not None:
+            tissue = table["tissue"]
+            tissue["order"] = max(2, tissue["order"])
+            tissue["refine"] = {**tissue.get("refine", {}), "tolerance": tolerance}
+
+    return scene.changed(edit)

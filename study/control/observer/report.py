@@ -1,0 +1,71 @@
+"""The part of a page about an observer: what it measures, what the loop with it does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from softgrasp.study.control.observer.result import ObservedStudy
+from softgrasp.study.report.page import Section
+from softgrasp.study.report.tables import listed
+
+SAMPLES = ("sample", "standard deviation", "with what the filter leaves out")
+OUTPUTS = ("output", "estimate [m, rad]", "by the full filter [m, rad]", "from the target [m, rad]")
+
+
+def observer_sections(study: ObservedStudy) -> list[Section]:
+    """Loop, samples and outputs."""
+    found = study.observed
+    own = np.sqrt(np.diag(found.reduced.V))
+    samples = list(zip(found.sensors.names, found.sensors.sd.tolist(), own.tolist(), strict=True))
+    full = [None] * len(study.names) if found.sd_full is None else found.sd_full.tolist()
+    outputs = list(
+        zip(study.names, found.judged.sd_error.tolist(), full, found.judged.sd_outputs.tolist(), strict=True)
+    )
+    text = (
+        "Standard deviations under the disturbances of the scene, for ever: of the estimate in the loop, of the best "
+        "estimate from the markers alone of a tissue whose hand is known, and of the output from its target."
+    )
+    return [
+        Section("Observer", sentence(study), rows=list(facts(study)), terminal=True),
+        Section("Outputs under disturbances", text, header=OUTPUTS, rows=outputs),
+        Section("Samples", "Standard deviation of one sample.", header=SAMPLES, rows=samples),
+    ]
+
+
+def sentence(study: ObservedStudy) -> str:
+    """What came out."""
+    judged, N = study.observed.judged, study.observed.reduced.plant.N
+    return (
+        f"The full plant under the observer of {N} states is stable: its abscissa is {judged.abscissa:.4g} 1/s, with "
+        f"the state known {judged.abscissa_known:.4g} 1/s. What the disturbances cost is {judged.excess:.2%} above the "
+        "least."
+    )
+
+
+def facts(study: ObservedStudy) -> Iterator[tuple[str, str]]:
+    """Label and text."""
+    found, filter_ = study.observed, study.observed.reduced.filter
+    markers, late = len(found.sensors.nodes), filter_.delay
+    kinds = [f"{markers} markers"] * (markers > 0) + ["the force on the hand"] * (
+        len(found.sensors.sd) > found.sensors.markers.stop
+    )
+    yield "measured", listed(["the hand's velocity and pose" if filter_.speed else "the hand's pose", *kinds])
+    yield (
+        "samples",
+        f"{len(filter_.names)} a tick of {1e3 * found.controller.period:g} ms"
+        + (f", {late} ticks late" if late else ""),
+    )
+    if found.weight > 1:
+        yield "noise of what is left out", f"{found.weight:g} times the estimate: with less the full loop is not stable"
+    for name, value in found.without.items():
+        yield f"abscissa without {name}", f"{value:.4g} 1/s" + ("" if value < 0 else ": not stable")
+    if found.full is not None and study.sd_nodes is not None:
+        solution, (low, middle, high) = found.full.solution, study.sd_nodes
+        yield (
+            "full Kalman filter",
+            (f"rank {solution.rank}, {solution.counts['solves']} solves, true residual {solution.residual:.1e}"),
+        )
+        yield "its deviation at a node", f"{low:.2g} to {high:.2g} m, median {middle:.2g} m"
+    yield "time of a tick", f"{1e6 * study.tick:.2g} us in Python"

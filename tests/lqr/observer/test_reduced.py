@@ -1,0 +1,174 @@
+"""The filter that runs: its Riccati equation, lost and late samples, and its judgement on the full plant."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.linalg
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import Stopwatch, build
+from softgrasp.fem.scene.file import load_scene
+from softgrasp.lqr.design.feedback import Design, design
+from softgrasp.lqr.design.observer import ObservedControl, observe
+from softgrasp.lqr.loop.controller import Controller
+from softgrasp.lqr.observer.judge import Ticks, loop_map, make_ticks
+from softgrasp.lqr.observer.reduced import reduced_filter
+from softgrasp.lqr.observer.sensors import make_disturbance
+from softgrasp.lqr.plant.checks import ControlError
+
+OBSERVER = "control.observer={markers=[[0,0],[1,0],[0,1],[1,1]],disturbance={box=[[0,0],[1,0]]}}"
+SMALL = "tissue.cells=[4,8]"
+
+
+@cache
+def observed(*overrides: str) -> tuple[Design, ObservedControl, Ticks]:
+    model = build(load_scene("paper_lqr", [SMALL, OBSERVER, *overrides]), comm=MPI.COMM_WORLD)
+    made = design(model)
+    found = observe(made, Stopwatch(model.system.layout.comm))
+    acting = make_disturbance(made.problem, 0.02, 0.05, [[0, 0], [1, 0]])
+    return made, found, make_ticks(made.problem, found.loop, found.sensors, acting, found.controller.period)
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize(("Q", "most"), [("1.0", 0.002), ("1e6", 0.11)])
+def test_loop_with_observer_is_as_fast_as_with_the_state_known(Q: str, most: float) -> None:
+    judged = observed(f"control.Q={Q}")[1].judged
+    assert judged.abscissa < 0.98 * judged.abscissa_known < 0
+    assert 0 < judged.excess <= most  # the least cost is that of the known state
+
+
+def test_filter_that_ignores_what_it_leaves_out_spills_over() -> None:
+    made, found, ticks = observed("control.Q=1e6")
+    acting = make_disturbance(made.problem, 0.02, 0.05, [[0, 0], [1, 0]])
+    naive = reduced_filter(made.problem, found.loop.plant, found.sensors, acting, 14, 1e-3, weight=0.0)
+    slow = np.log(np.abs(np.linalg.eigvals(loop_map(ticks, found.controller.K, naive.filter).F)).max()) / 1e-3
+    own = naive.filter
+    fast = np.log(np.abs(np.linalg.eigvals(own.A @ (np.eye(14) - own.M @ own.C))).max()) / 1e-3
+    assert fast < -1  # on its own plant nothing shows
+    assert -0.1 < slow < 0  # the full one is a tenth as fast as with the state known
+
+
+def test_correction_solves_the_riccati_equation_of_the_ticks() -> None:
+    own = observed()[1].reduced
+    A, C, P = own.filter.A, own.filter.C, own.P
+    after = P - own.filter.M @ C @ P
+    gain = P @ C.T @ np.linalg.inv(C @ P @ C.T + own.V)
+    assert np.abs(own.filter.M - gain).max() < 1e-9 * np.abs(gain).max()  # rounding through the condition of C P C' + V
+    W = P - A @ after @ A.T  # what a tick adds: of the disturbances, no more
+    assert np.linalg.eigvalsh((W + W.T) / 2).min() > -1e-9 * np.abs(W).max()
+
+
+def run(plant: Ticks, controller: Controller, ticks: int, start: np.ndarray, lost: slice | None = None) -> np.ndarray:
+    """States of the full plant under ``Controller.step`` without noise, (ticks, n)."""
+    x, late, rows = start, [np.full(len(plant.C), np.nan)] * controller.observer.delay, []
+    controller.reset()
+    for _ in range(ticks):
+        late.append(plant.C @ x)
+        sample = late.pop(0)
+        y = np.array(sample[2:])
+        if lost is not None:
+            y[lost] = np.nan
+        u = controller.step(x[:2], x[2:4], y)
+        rows.append(x)
+        x = plant.A @ x + plant.B @ u
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_judged_map_is_what_step_does(delay: int) -> None:
+    _, found, plant = observed()
+    own, n = replace(found.controller.observer, delay=delay), len(plant.A)
+    controller = replace(found.controller, observer=own, x_bar=0 * found.controller.x_bar)
+    start = np.random.default_rng(3).standard_normal(n)
+    start[:4] = 0.0  # what the filter starts from
+    rows = run(plant, controller, 40, start, lost=slice(0, 2))
+    # at the tick at which the first samples arrive: the state, what the filter starts from, inputs and samples before
+    x = rows[: delay + 1]
+    inputs = [np.linalg.lstsq(plant.B, b - plant.A @ a)[0] for a, b in pairwise(x)]
+    state = np.concatenate([x[-1], np.zeros(14), *inputs[::-1], *(plant.C @ past for past in x[-2::-1])])
+    F = loop_map(plant, controller.K, own, np.isin(np.arange(10), [2, 3])).F
+    for row in rows[delay + 1 :]:
+        state = F @ state
+        assert np.abs(state[:n] - row).max() < 1e-9  # rounding of 40 ticks, and of the inputs found from the states
+
+
+def test_estimate_of_its_own_plant_is_exact_with_samples_lost_and_late() -> None:
+    found = observed()[1]
+    own = replace(found.controller.observer, delay=2)
+    controller = replace(found.controller, observer=own)
+    x, late, generator = np.zeros(14), [np.full(10, np.nan)] * 2, np.random.default_rng(1)
+    for tick in range(200):
+        late.append(own.C @ x)
+        y = late.pop(0)[2:]
+        given = None if tick % 7 == 0 else np.where(generator.random(8) < 0.3, np.nan, y)
+        u = controller.step(x[:2], x[2:4], given)
+        assert np.abs(controller._x - x).max() < 1e-12 * (1 + np.abs(x).max()) * 200  # rounding of 200 ticks
+        x = own.A @ x + own.B @ u + own.f
+    assert np.abs(x[:2]).min() > 1e-3  # it moved
+
+
+def test_cost_and_deviations_are_those_of_another_lyapunov_solver() -> None:
+    made, found, plant = observed()
+    judged, controller, n = found.judged, found.controller, len(plant.A)
+    loop = loop_map(plant, controller.K, controller.observer)
+    X = scipy.linalg.solve_discrete_lyapunov(loop.F, loop.noise @ loop.noise.T, method="bilinear")
+    close = 1e-7  # |X| / distance of the spectrum from the circle, 2e-5, in units of rounding
+    assert np.abs(judged.covariance - X[:n, :n]).max() < close * np.abs(X).max()
+    seen = np.hstack([plant.y, np.zeros((2, 14))])
+    off = seen - controller.plant.C @ loop.estimate
+    at_once = controller.plant.C @ loop.direct
+    assert np.allclose(judged.sd_error, np.sqrt(np.diag(off @ X @ off.T + at_once @ at_once.T)), rtol=1e-5)
+    u, now = controller.K @ loop.estimate, controller.K @ loop.direct
+    cost = np.trace(made.problem.Q @ seen @ X @ seen.T) + np.trace(made.problem.R @ (u @ X @ u.T + now @ now.T))
+    assert abs(judged.cost / cost - 1) < close
+    # the least cost, of the known state and the law in continuous time, from the other side
+    F = plant.A + plant.B @ found.loop.gain(made.gain.block)
+    Y = scipy.linalg.solve_discrete_lyapunov(F, plant.W @ plant.W.T, method="bilinear")
+    K = found.loop.gain(made.gain.block)
+    least = np.trace(made.problem.Q @ plant.y @ Y @ plant.y.T) + np.trace(made.problem.R @ K @ Y @ K.T)
+    assert abs(judged.cost_known / least - 1) < 3e-4  # the law is held for a millisecond, which costs 1.5e-4
+
+
+def test_controller_with_observer_survives_a_file(tmp_path: Path) -> None:
+    found = observed()[1].controller
+    again = Controller.load(found.save(tmp_path / "observer.npz"))
+    found.reset()
+    q, v, y = np.array([0.1, 0.2]), np.zeros(2), np.linspace(0.1, 0.2, 8)
+    for _ in range(5):
+        assert np.array_equal(again.step(q, v, y), found.step(q, v, y))
+    assert again.observer.names == found.observer.names
+
+
+def test_what_step_cannot_take_is_refused() -> None:
+    found = observed()[1].controller
+    found.reset()
+    with pytest.raises(ControlError, match="this controller takes 8 samples beside q_s"):
+        found.step(np.zeros(2), np.zeros(2), np.zeros(3))
+    found.reset()
+    with pytest.raises(ControlError, match="first samples of the hand must be finite"):
+        found.step(np.full(2, np.nan), np.zeros(2))
+    with pytest.raises(ControlError, match="no observer that takes y"):
+        replace(found, observer=None).step(np.zeros(2), np.zeros(2), np.zeros(8))
+    with pytest.raises(ControlError, match="observer has 14 states, the plant of the controller"):
+        replace(found, observer=replace(found.observer, A=np.eye(14), B=np.zeros((14, 3))))
+
+
+@pytest.mark.parametrize(
+    ("override", "sentence"),
+    [
+        ("control.observer.N=400", "control.observer.N is 400; this plant has observers of 10 to"),
+        ("effects.damping=false", "damping"),
+        ("control.method='modal'", "leave out control.method = 'modal'"),
+        ("control.loop={sampling='held',rate=2.0,delay=1}", "give control.observer.delay instead"),
+        ("tissue.cells=[30,60]", "an observer is checked with all modes of the plant, at most 1300"),
+    ],
+)
+def test_scenes_without_an_observer_are_refused(override: str, sentence: str) -> None:
+    with pytest.raises(Exception, match=sentence.replace(".", r"\.")):
+        observed(override)
