@@ -162,13 +162,12 @@ class Contact:
         self.moved = self._take(self.midpoint.w_array)
         x1 = self.surface.places(drive.q[n + 1], self.z + 2 * self.moved)
         self.after = self._gaps(x1, n + 1)
-        if not self.flat:
-            x0 = self.surface.places(drive.q[n], self.z)
-            check_passage(self.obstacles, self.gaps, self.after, (x0, x1), (n * self.dt, (n + 1) * self.dt))
+        x0 = self.surface.places(drive.q[n], self.z)
+        check_passage(self.obstacles, self.gaps, self.after, (x0, x1), (n * self.dt, (n + 1) * self.dt))
         if self.after.min() >= 0:
             self.rows = self._make_rows(np.zeros((0, 2), dtype=int))
             return
-        f, self.rows = self._settle(n, self.surface.places(drive.q[n], self.z), x1)
+        f, self.rows = self._settle(n, x0, x1)
         self._add(n, f, drive)
         rows, table = self.rows, self.table
         np.add.at(table.force[n], rows.obstacle, rows.x[:, None] * rows.normal)
