@@ -22,7 +22,7 @@ from softgrasp.fem.owned import LIST
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.fem.scene.scene import scene_schema
 from softgrasp.study.forward.run import run_simulate
-from softgrasp.study.report.tables import show_sections
+from softgrasp.study.report.document import show_sections
 from softgrasp.study.runs import sweep as sweep_module
 from softgrasp.study.runs.listing import apart, compare, run_compare, runs_below
 from softgrasp.study.runs.run import run_sweep, short_table
