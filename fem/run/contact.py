@@ -27,7 +27,7 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.surface import make_surface
 from softgrasp.fem.obstacles import HalfSpace, make_obstacles
-from softgrasp.fem.obstacles.obstacle import mean_normal
+from softgrasp.fem.obstacles.obstacle import check_passage, mean_normal
 from softgrasp.fem.obstacles.responses import Responses
 from softgrasp.fem.obstacles.small import SmallProblem
 from softgrasp.fem.petsc import Array, rows_on_all, total
@@ -156,16 +156,18 @@ class Contact:
     def press(self, n: int, drive: TableDrive | ForceDrive) -> None:
         """Turn the step without contact in the midpoint into one that leaves no penetration. Collective.
 
-        Raises SolverError: the rounds of the step do not end.
+        Raises SolverError: the rounds of the step do not end, or the step could carry a node through an obstacle.
         """
         self.n, self.drive = n, drive
         self.moved = self._take(self.midpoint.w_array)
         x1 = self.surface.places(drive.q[n + 1], self.z + 2 * self.moved)
         self.after = self._gaps(x1, n + 1)
+        x0 = self.surface.places(drive.q[n], self.z)
+        check_passage(self.obstacles, self.gaps, self.after, (x0, x1), (n * self.dt, (n + 1) * self.dt))
         if self.after.min() >= 0:
             self.rows = self._make_rows(np.zeros((0, 2), dtype=int))
             return
-        f, self.rows = self._settle(n, self.surface.places(drive.q[n], self.z), x1)
+        f, self.rows = self._settle(n, x0, x1)
         self._add(n, f, drive)
         rows, table = self.rows, self.table
         np.add.at(table.force[n], rows.obstacle, rows.x[:, None] * rows.normal)
