@@ -11,7 +11,8 @@ from softgrasp.fem.columns import labels
 from softgrasp.reduction.identify.result import Identified
 from softgrasp.reduction.identify.verdict import BY_CHANCE, direction_in_words, percent
 from softgrasp.study.report import Section, Table, captioned, listed
-from softgrasp.study.shell import Page, Session
+from softgrasp.study.shell import Session
+from softgrasp.study.shell.session import Page
 
 CAPTIONS = {
     "fit.png": "Above: measured outputs (dots) and the fit (lines), of each experiment. Below: residuals over the "
