@@ -6,9 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS
-from softgrasp.study.reduce.linear.findings import findings
 from softgrasp.study.reduce.linear.measure import FURTHER, chosen_methods
-from softgrasp.study.reduce.linear.page import error_table, least_size, stability
+from softgrasp.study.reduce.linear.page import error_table, findings, least_size, stability
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, best, kept_points, nearest
 from tests.helpers.models import make_scene
 
