@@ -100,12 +100,10 @@ def advised_together(
     joined |= _singles(runs, tried, on, shut, tolerance)
     return on, {
         name: JointChange(
-            change=runs.change(on, on ^ {name}),
-            control=runs.control(on, on ^ {name}),
-            **vars(joined.get(name, Shown())),
+            **vars(joined.get(name, Shown())), change=runs.change(on, other), control=runs.control(on, other)
         )
-        for name in tried
-        if not runs.refusal(other := on ^ {name})
+        for name, other in ((name, on ^ {name}) for name in tried)
+        if not runs.refusal(other)
     }
 
 
