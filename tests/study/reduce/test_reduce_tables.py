@@ -9,6 +9,7 @@ from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS
 from softgrasp.study.reduce.linear.measure import FURTHER, chosen_methods
 from softgrasp.study.reduce.linear.page import error_table, findings, least_size, stability
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, best, kept_points, nearest
+from softgrasp.study.report.document import cell_text
 from tests.helpers.models import make_scene
 
 PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"
