@@ -26,7 +26,8 @@ pytestmark = [
     pytest.mark.serial,
     pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler cc here"),
 ]
-OBSERVER = "control.observer={markers=[[0,0],[1,0],[0,1],[1,1]],disturbance={box=[[0,0],[1,0]]},noise={speed=0.01},delay=2}"
+SAMPLES = "markers=[[0,0],[1,0],[0,1],[1,1]],noise={speed=0.01},delay=2"
+OBSERVER = f"control.observer={{{SAMPLES},disturbance={{box=[[0,0],[1,0]]}}}}"
 
 
 @cache
