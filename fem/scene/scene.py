@@ -128,7 +128,7 @@ class Time(Section):
     steps: Annotated[int, Field(ge=1)] = Field(description="number of equal time steps [1], >= 1")
     end: Positive | None = Field(None, description="end time [s]; default motion.duration")
     start: Literal["rest", "equilibrium"] = Field(
-        "rest", description="start undeformed, or in equilibrium under gravity [no unit]"
+        "rest", description="start undeformed, or in equilibrium under gravity and with obstacles [no unit]"
     )
     solver: Literal["auto", "cholesky", "mumps", "cg", "stars"] = Field("auto", description="linear solver [no unit]")
     rtol: Dropped[Annotated[float, Field(gt=0, lt=1)]] = Field(
@@ -274,7 +274,7 @@ class Scene(Shown, Section):
                 "effects.finite_strain cannot go with effects.rotation, whose linearised turns would stretch the "
                 "tissue; set one of them to false"
             )
-        if self.time.start == "equilibrium" and effects.gravity is None:
+        if self.time.start == "equilibrium" and effects.gravity is None and not effects.obstacles:
             raise ValueError("time.start is 'equilibrium' but effects.gravity is off; use 'rest' or give gravity")
         if self.contact.facet_tag is not None and self.tissue.mesh is None:
             raise ValueError("contact.facet_tag needs tissue.mesh; on a structured box give sides or box")
