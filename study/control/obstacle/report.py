@@ -17,8 +17,8 @@ CAPTIONS = {
     "obstacle.png": "The boundary of the body on the full plant under the plan, and the way of its middle; grey and "
     "dashed: under the optimal feedback, which knows no obstacle, where it is deepest inside.",
     "gaps.png": "Gap of the body to every obstacle on the full plant, with a band of three standard deviations where "
-    "an observer keeps it on its way under noise. Dashed: clearance and margins, which the reduced plant keeps; the full "
-    "plant may use the margins up. Below: force and speed of the hand with their limits.",
+    "an observer keeps it on its way under noise. Dashed: clearance and margins, which the reduced plant keeps; the "
+    "full plant may use the margins up. Below: force and speed of the hand with their limits.",
     "times.png": "Times of the quadratic program in Python, without a guess and from the rows that hold a plan nearby, "
     "against a tick of the loop and the interval after which the next plan is due.",
 }
