@@ -16,10 +16,10 @@ from pydantic import TypeAdapter
 from rich.console import Console
 
 from softgrasp.fem.errors import SoftgraspError
+from softgrasp.study.report.document import Columns as Columns
+from softgrasp.study.report.document import Table, number
+from softgrasp.study.report.document import table_of as table_of
 from softgrasp.study.report.files import write_json
-from softgrasp.study.report.tables import Columns as Columns
-from softgrasp.study.report.tables import Table, number
-from softgrasp.study.report.tables import table_of as table_of
 from softgrasp.study.shell.processes import in_mpi_job, run_ranks
 
 Row = dict[str, Any]

@@ -20,7 +20,7 @@ from rich.console import Console
 from benchmarks import driver
 from benchmarks.driver import Row
 from softgrasp.fem.errors import SoftgraspError
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report.document import Table
 
 LIMIT = 1800.0  # [s] of one run of a command
 NAME = "bench_figures"

@@ -12,7 +12,7 @@ from rich.console import Console
 from benchmarks import driver
 from benchmarks.driver import Failure, Goal
 from benchmarks.forward_rows import ForwardCost
-from softgrasp.study.report.tables import Table, number
+from softgrasp.study.report.document import Table, number
 from softgrasp.study.shell.timing import power_law
 
 SIZES = "2d:1000,2d:10000,2d:100000,3d:50000"

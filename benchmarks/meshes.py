@@ -25,9 +25,9 @@ from softgrasp.reduction.bases.registry import METHODS, find_method
 from softgrasp.reduction.replay import full_run
 from softgrasp.study.reduce.linear.measure import sweep
 from softgrasp.study.reduce.times import steps_seconds
+from softgrasp.study.report.document import Table
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import machine
-from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.ending import console
 from softgrasp.study.shell.session import list_files
 from softgrasp.study.shell.timing import power_law

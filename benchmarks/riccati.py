@@ -34,9 +34,9 @@ from softgrasp.lqr.plant.operators import costates_to_relative, gain_to_absolute
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.riccati import gain_error, tissue_gain_error
 from softgrasp.lqr.riccati import Method, make_solver
+from softgrasp.study.report.document import number
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import peak_memory_mb
-from softgrasp.study.report.tables import number
 from softgrasp.study.shell.timing import power_law, repeated
 
 SIZES = "10,20,40,80,160"

@@ -16,7 +16,7 @@ from benchmarks import driver
 from benchmarks.driver import Failure, Goal
 from benchmarks.scale_rows import STEPS, ScaleCost, scale_scene
 from softgrasp.fem.run.forecast import forecast
-from softgrasp.study.report.tables import Table, number
+from softgrasp.study.report.document import Table, number
 from softgrasp.study.shell.timing import power_law
 
 SIZES = (

@@ -16,7 +16,7 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.solve.costs import GUESSED, ITERATIVE, SolverName, Work
 from softgrasp.fem.solve.solvers import TissueSolver, make_solver
-from softgrasp.study.report.tables import number
+from softgrasp.study.report.document import number
 
 DT = 5e-3  # [s]
 STEP_RTOL = 1e-8  # from zero, what the model's iterations are of

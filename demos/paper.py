@@ -19,8 +19,8 @@ from softgrasp.study.control.result import TITLES
 from softgrasp.study.control.run import run_control
 from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.reduce.run import run_reduce
-from softgrasp.study.report.page import Section, write_report
-from softgrasp.study.report.tables import percent
+from softgrasp.study.report.document import Page, Section, percent
+from softgrasp.study.report.page import write_report
 
 Row = tuple[str, str, str, str, str]
 HEADER = ("quantity", "paper", "here", "verdict", "why different")
@@ -273,8 +273,7 @@ def write_page(out: Path, results: dict[str, dict[str, Any]]) -> list[Path]:
     forward, control = forward_rows(results["forward"], results["reduce"]), control_rows(results["control"])
     forward += mesh_rows(results["forward"], results["accurate"])
     figures = [(out / name, text) for name, text in FIGURES if (out / name).exists()]
-    page = write_report(
-        out / "paper.html",
+    page = Page(
         title="The paper, again",
         summary=[_count(forward + control), *_differ(forward + control)],
         subtitle="Shuva, Buchfink, Röhrle, Haasdonk: Reduced Basis Methods for Efficient Simulation of a Rigid Robot "
@@ -287,7 +286,7 @@ def write_page(out: Path, results: dict[str, dict[str, Any]]) -> list[Path]:
             Section("Pages behind it", text=PAGES),
         ],
         files=[out / name / "report.html" for name in ("forward", "accurate", "reduce", "control")],
-        reproduce="make paper",
+        command="make paper",
         numbers="paper.json, and result.json in forward, accurate, reduce and control",
     )
     data = out / "paper.json"
@@ -295,7 +294,7 @@ def write_page(out: Path, results: dict[str, dict[str, Any]]) -> list[Path]:
     data.write_text(
         json.dumps({k: [dict(zip(HEADER, r, strict=True)) for r in v] for k, v in tables.items()}, indent=2)
     )
-    return [page, data]
+    return [write_report(out / "paper.html", page, files=page.files), data]
 
 
 def _table(title: str, rows: list[Row]) -> Section:

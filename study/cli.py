@@ -141,8 +141,7 @@ def compare(
     """Show in which keys, numbers and trajectories two runs differ."""
     from softgrasp.study.runs.listing import run_compare
 
-    if rank() == 0:
-        run_compare(a, b, out or default_folder("compare", Path(f"{a.name}-{b.name}")), console(), **shared)
+    run_compare(a, b, out or default_folder("compare", Path(f"{a.name}-{b.name}")), console(), **shared)
 
 
 @app.command(rich_help_panel=LOOK)

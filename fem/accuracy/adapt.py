@@ -20,7 +20,7 @@ from softgrasp.fem.model.build import MeshEstimate, Model
 from softgrasp.fem.model.build import build as build_on
 from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.scene.file import as_overrides
+from softgrasp.fem.scene.file import as_overrides, load_scene_collective
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene
@@ -39,7 +39,9 @@ def build(
     overrides: Sequence[str] = (),
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     *,
-    mesh: TissueMesh | None = None,
+    mesh: TissueMesh | Any = None,
+    cell_tags: Any = None,
+    facet_tags: Any = None,
     steps: bool = True,
     **tables: Any,
 ) -> Model:
@@ -52,7 +54,10 @@ def build(
         scene: a scene, the path of its file, or the name of one that ships.
         overrides: "section.key=value" each, as after ``--set``; for a file or a name.
         tables: the same by sections, ``tissue={"cells": [4, 8]}``.
-        mesh: on which, as it is; None makes that of the scene.
+        mesh: a DOLFINx mesh, or what `dolfinx.io.gmsh.model_to_mesh` returns, in the place of the scene's box or file
+            (:func:`softgrasp.fem.mesh.given.with_given_mesh`); a `TissueMesh` as it is; None makes that of the scene.
+        cell_tags: marks of the cells of a DOLFINx mesh, (`dolfinx.mesh.MeshTags`), for ``tissue.layers.NAME.tag``.
+        facet_tags: marks of its facets, for ``contact.facet_tag``.
         steps: whether the time steps have to carry the tolerance too: those of the scene's own run.
 
     Raises:
@@ -68,7 +73,13 @@ def build(
     160
     """
     begin = time.perf_counter()
-    model = build_on(scene, [*overrides, *as_overrides(tables)], comm, mesh=mesh)
+    keys = [*overrides, *as_overrides(tables)]
+    if mesh is not None and not isinstance(mesh, TissueMesh):
+        from softgrasp.fem.mesh.given import with_given_mesh  # only given meshes pay for it
+
+        scene = load_scene_collective(comm, scene, keys) if isinstance(scene, str | Path) else scene
+        scene, keys, mesh = with_given_mesh(scene, comm, mesh, cell_tags, facet_tags), [], None
+    model = build_on(scene, keys, comm, mesh=mesh)
     scene, refine = model.scene, model.scene.tissue.refine
     if refine is None or refine.tolerance is None or refine.passes == 0 or mesh is not None:
         return model

@@ -197,7 +197,14 @@ def hanging_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
     return np.unique(node[on & (shares.max(axis=1, initial=0) < 1 - tolerance)])
 
 
-def doubled_text(points: Floats, first: Integers, tolerance: float, joined: bool, name: str) -> list[str]:
+def doubled_text(
+    points: Floats,
+    first: Integers,
+    tolerance: float,
+    joined: bool,
+    name: str,
+    advice: str = "set tissue.repair = true to join them",
+) -> list[str]:
     """The warning about doubled nodes, from :func:`doubled_nodes`; empty if there are none."""
     nodes = np.flatnonzero(first != np.arange(len(first)))
     if not nodes.size:
@@ -208,7 +215,7 @@ def doubled_text(points: Floats, first: Integers, tolerance: float, joined: bool
         return [f"{name} had {count} {place}, {near}: tissue.repair joined {'it' if nodes.size == 1 else 'them'}."]
     return [
         f"{name} has {count} {place}, {near}, and the body is open there as along a crack: "
-        "set tissue.repair = true to join them, unless a crack is meant."
+        f"{advice}, unless a crack is meant."
     ]
 
 

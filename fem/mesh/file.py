@@ -142,7 +142,8 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limi
 def _read(path: Path, limit: float | None) -> meshio.Mesh:
     try:
         if not path.is_file():
-            raise MeshError(f"The mesh file {path} does not exist: tissue.mesh is relative to the scene file.")
+            given = " ('given' is a mesh that a program passes to softgrasp.build)" if path.name == "given" else ""
+            raise MeshError(f"The mesh file {path} does not exist: tissue.mesh is relative to the scene file{given}.")
         return read_foreign(path, limit)
     except TimeoutError as error:
         raise MeshError(

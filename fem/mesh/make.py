@@ -9,7 +9,7 @@ from softgrasp.fem.scene.scene import Scene
 
 
 def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
-    """Build the mesh of a scene: structured if ``tissue.size`` is given, else from ``tissue.mesh``.
+    """Build the mesh of a scene: the given one, structured if ``tissue.size`` is set, else from ``tissue.mesh``.
 
     Collective.
 
@@ -18,6 +18,8 @@ def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
         MeshError: the mesh file cannot be read or its mesh cannot carry the model.
     """
     tissue = scene.tissue
+    if scene._given is not None:
+        return scene._given.on(comm)
     if tissue.size:
         return structured_mesh(comm, tissue.size, tissue.cells or [], tissue.origin)
     from softgrasp.fem.mesh.file import read_mesh  # meshio is needed for mesh files only

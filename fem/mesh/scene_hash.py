@@ -42,7 +42,8 @@ def _resolved(scene: Scene, without: Iterable[str]) -> dict[str, Any]:
     data = scene.model_dump(mode="json", by_alias=True, exclude=set(without))
     tissue, motion = data.get("tissue", {}), data.get("motion", {})
     if tissue.get("mesh") is not None:
-        tissue["mesh"] = scene._mesh_digest or _mesh_digest(scene)
+        given = scene._given
+        tissue["mesh"] = scene._mesh_digest or (_mesh_digest(scene) if given is None else given.tissue.digest)
     if motion.get("csv") is not None:
         motion["csv"] = _digest(scene, motion["csv"], "motion.csv")
     replace_paths(data, lambda name: _digest(scene, name, "csv of an obstacle's path"))

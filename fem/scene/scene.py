@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, PrivateAttr, model_validator
 
@@ -19,6 +19,9 @@ from softgrasp.fem.scene.control import BASES, Control, ControlOutput, Loop, Red
 from softgrasp.fem.scene.obstacles import Obstacle, check_obstacle_vectors, check_obstacles
 from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, NonNegative, Positive, Section, Tissue
 from softgrasp.fem.shown import Card, Shown, brief, listed
+
+if TYPE_CHECKING:
+    from softgrasp.fem.mesh.given import GivenMesh
 
 __all__ = [
     "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Loop", "Material",
@@ -124,7 +127,7 @@ class Time(Section):
     steps: Annotated[int, Field(ge=1)] = Field(description="number of equal time steps [1], >= 1")
     end: Positive | None = Field(None, description="end time [s]; default motion.duration")
     start: Literal["rest", "equilibrium"] = Field(
-        "rest", description="start undeformed, or in equilibrium under gravity [no unit]"
+        "rest", description="start undeformed, or in equilibrium under gravity and with obstacles [no unit]"
     )
     solver: Literal["auto", "cholesky", "mumps", "cg", "stars"] = Field("auto", description="linear solver [no unit]")
     rtol: Dropped[Annotated[float, Field(gt=0, lt=1)]] = Field(
@@ -199,6 +202,7 @@ class Scene(Shown, Section):
     """results that are kept [no unit]"""
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
     _mesh_digest: str = PrivateAttr("")  # of the mesh file, once it was read
+    _given: GivenMesh | None = PrivateAttr(None)  # mesh of the user's own in the place of the file
 
     def card(self) -> Card:
         """Purpose, body, effects, motion and steps."""
@@ -236,6 +240,7 @@ class Scene(Shown, Section):
         edit(data)
         result = Scene.model_validate(data)
         result._directory = self._directory
+        result._given = self._given if result.tissue.mesh == self.tissue.mesh else None
         return result
 
     def path(self, name: str) -> Path:
@@ -268,7 +273,7 @@ class Scene(Shown, Section):
                 "effects.finite_strain cannot go with effects.rotation, whose linearised turns would stretch the "
                 "tissue; set one of them to false"
             )
-        if self.time.start == "equilibrium" and effects.gravity is None:
+        if self.time.start == "equilibrium" and effects.gravity is None and not effects.obstacles:
             raise ValueError("time.start is 'equilibrium' but effects.gravity is off; use 'rest' or give gravity")
         if self.contact.facet_tag is not None and self.tissue.mesh is None:
             raise ValueError("contact.facet_tag needs tissue.mesh; on a structured box give sides or box")

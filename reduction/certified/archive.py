@@ -62,8 +62,6 @@ def _write(model: CertifiedModel, group: h5py.Group) -> None:
     group.attrs["format"] = FORMAT
     group["about"] = np.frombuffer(json.dumps(data).encode(), dtype=np.uint8)  # attributes end at 64 kB
     group["static"], group["mass"], group["compliance"] = norms.static, norms.mass, model.compliance
-    for i, T in enumerate(norms.shape or ()):
-        group[f"shape/{i}"] = T
     if model.duals is not None:
         for key, value in vars(model.duals.blocks).items():
             group[f"duals/{key}"] = value
@@ -115,7 +113,6 @@ def _read(group: h5py.Group) -> dict[str, Any]:
     for name in ("finer", "drive"):
         if name in group:
             drive = _read_drive(group[name], drive)
-    shape = (group["shape/0"][()], group["shape/1"][()]) if "shape" in group else None
     static, mass, compliance = (group[name][()] for name in ("static", "mass", "compliance"))
     data = json.loads(group["about"][()].tobytes())
     duals = None
@@ -123,13 +120,13 @@ def _read(group: h5py.Group) -> dict[str, Any]:
         arrays = {key: value[()] for key, value in group["duals"].items()}
         C, triangle = arrays.pop("C"), arrays.pop("triangle")
         duals = OutputDuals(SecondOrder(**arrays), C, triangle)
-    return {**_about(data, static, mass, shape), "compliance": compliance, "drive": drive, "duals": duals}
+    return {**_about(data, static, mass), "compliance": compliance, "drive": drive, "duals": duals}
 
 
-def _about(data: dict[str, Any], static: Array, mass: Array, shape: tuple[Array, Array] | None) -> dict[str, Any]:
+def _about(data: dict[str, Any], static: Array, mass: Array) -> dict[str, Any]:
     reference = tuple(LayerMaterial(**m) for m in data["reference"])
     low, high = data["omega"]
-    norms = ResidualNorms(static, mass, reference, data["n_s"], data["dimension"], (low, high), shape)
+    norms = ResidualNorms(static, mass, reference, data["n_s"], data["dimension"], (low, high))
     mesh, box = data["mesh"], data["box"]
     if mesh is not None:
         mesh = OfflineMeshEstimate(tuple((a, b) for a, b in mesh["places"]), tuple(mesh["estimates"]))

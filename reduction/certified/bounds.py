@@ -57,9 +57,6 @@ def static_bound(
     dt: float,
     balanced: bool = False,
     kernel: Kernel | None = None,
-    drift: Array | None = None,
-    gap: Array | None = None,
-    start: float = 0.0,
 ) -> Array:
     """|e|_E at every step, (steps + 1,).
 
@@ -69,14 +66,10 @@ def static_bound(
         dt: step [s].
         balanced: a start in equilibrium, where e_0 = -K^-1 r^_0; else at rest, e_0 = 0.
         kernel: see :func:`decay`; None: nothing decays.
-        drift: |z_r' - v~|_K of inexact kinematics, (steps,).
-        gap: |v~ - v_r|_M of the same at the steps, (steps + 1,).
-        start: |v~_0|_M of the same.
     """
     node = lengths(nodes)
-    rate = lengths(np.diff(nodes)) / dt
-    force = np.hypot(rate if drift is None else rate + drift, rest)
-    begin = np.hypot(0.0 if balanced else node[0], start)
+    force = np.hypot(lengths(np.diff(nodes)) / dt, rest)
+    begin = 0.0 if balanced else node[0]
     steps = len(force)
     moved = np.zeros(steps + 1)
     if kernel is None:
@@ -88,7 +81,7 @@ def static_bound(
         free, forced = kernel
         moved[1:] = dt * convolve(force, forced[:steps])[:steps]
         moved += begin * free[: steps + 1]
-    return np.asarray(moved + (node if gap is None else np.hypot(node, gap)))
+    return np.asarray(moved + node)
 
 
 def decay(low: float, high: float, alpha: float, beta: float, dt: float, steps: int) -> Kernel | None:

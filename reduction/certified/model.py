@@ -88,13 +88,13 @@ class CertifiedModel(Shown):
     duals: OutputDuals | None = None
 
     def __post_init__(self) -> None:
-        fine, k2, second = self.fine, self.norms.k, self.fine.structure == "second_order"
-        if not (fine.fixed_solid and fine.frame == "relative" and (second or self.norms.shape is not None)):
-            raise ModelError("a certificate needs a basis with fixed solid modes relative to the hand", fine.name)
-        if fine.two_way and not second:
-            raise ModelError("with two-way coupling only a second-order basis has a certificate", fine.name)
-        if not 0 < self.k <= k2 or (self.k < k2 and not second):
-            raise ModelError(f"k = {self.k} of {k2} modes; only second-order bases have leading ones", fine.name)
+        fine, k2 = self.fine, self.norms.k
+        if not (fine.fixed_solid and fine.frame == "relative" and fine.structure == "second_order"):
+            raise ModelError(
+                "a certificate needs a second-order basis with fixed solid modes relative to the hand", fine.name
+            )
+        if not 0 < self.k <= k2:
+            raise ModelError(f"k = {self.k}; it must be between 1 and {k2}", fine.name)
         if self.certify != "proof" and self.k == k2:
             object.__setattr__(self, "certify", "proof")
 
@@ -249,7 +249,7 @@ class CertifiedModel(Shown):
         norms = self.norms if residual else None
         hand = known_hand(model, drive, g)
         alike = all(len({m.beta for m in materials}) == 1 for materials in many)
-        if model.structure == "second_order" and hand is not None and alike:
+        if hand is not None and alike:
             return modal_motions(model, self._blocks[k], norms, many, drive, g, hand)
         return [stepped_motion(model, norms, materials, drive, g) for materials in many]
 
@@ -333,8 +333,7 @@ class CertifiedModel(Shown):
         if not self._coupled(drive) and len(betas) == 1 and self.fine.damped:
             low, high = self.norms.frequencies(materials)
             kernel = bounds.decay(low, high, self.fine.alpha, betas.pop(), drive.dt, drive.steps)
-        drift, gap, start = r.inexact or (None, None, 0.0)
-        return bounds.static_bound(r.nodes, r.rest, drive.dt, drive.start == "equilibrium", kernel, drift, gap, start)
+        return bounds.static_bound(r.nodes, r.rest, drive.dt, drive.start == "equilibrium", kernel)
 
     def _output_bound(self, bound: Array, materials: Materials, drive: Drive) -> Array:
         """Bound of every output component from one of the energy, (steps + 1, p)."""

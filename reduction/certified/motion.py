@@ -70,7 +70,6 @@ class Residual:
 
     nodes: Array  # T r^ in K^-1 at the steps, (w, steps + 1)
     rest: Array  # |r - mean r^|_{M^-1}, (steps,)
-    inexact: tuple[Array, Array, float] | None = None  # drift (steps,), gap (steps + 1,), start of inexact kinematics
 
 
 @dataclass(frozen=True)
@@ -231,7 +230,7 @@ def triangle_times(A: Array, x: Array, factor: float) -> Array:
 def stepped_motion(
     model: ReducedModel, norms: ResidualNorms | None, materials: Materials, drive: Drive, g: Array
 ) -> Motion:
-    """The same by the propagator of any model: two-way under a force, layers that differ in damping, (q, p) bases.
+    """The same by the propagator: two-way under a force, layers that differ in damping.
 
     Raises:
         ModelError: materials that the model cannot represent, or no single equilibrium to start in.
@@ -245,7 +244,7 @@ def stepped_motion(
     energy = small.total_energy(run.x) if coupled else small.energy(run.x)
     residual = None
     if norms is not None:
-        residual = stepped_residual(model, norms, materials, drive, g, run, small.scale)
+        residual = stepped_residual(model, norms, materials, drive, g, run)
     return Motion(run.q_s, run.v_s, run.outputs, float(np.sqrt(2 * max(energy.max(), 0.0))), residual, x=run.x)
 
 
@@ -256,13 +255,10 @@ def stepped_residual(
     drive: Drive,
     g: Array,
     run: ReducedTrajectory,
-    scale: float,
 ) -> Residual:
-    """Residual of any run: with the rates b of a second-order model, else with central differences of a."""
-    h, dt = 2 * len(g), drive.dt
-    x = run.x[:, h:].T
-    exact = model.structure == "second_order"
-    a, b = np.split(x, 2) if exact else (x, np.gradient(x, dt, axis=1))
+    """Residual of any run, from its amplitudes a and their rates b."""
+    dt = drive.dt
+    a, b = np.split(run.x[:, 2 * len(g) :].T, 2)
     middle = (b[:, 1:] + b[:, :-1]) / 2
     c = load_rows(model, run.v_s, dt, g)
     rows = np.vstack([c, np.diff(b, axis=1) / dt + model.alpha * middle, (a[:, 1:] + a[:, :-1]) / 2, middle])
@@ -276,14 +272,7 @@ def stepped_residual(
         G, root = hand_inertia(model, norms)
         pulled = root.T @ G.T @ np.hstack(norms.columns("mass", materials))
         mass = np.vstack([mass, pulled * max(1.0, norms.mass_factor(materials))])
-    inexact = None
-    if not exact and norms.shape is not None:
-        K, M = norms.shape
-        drift = norms.stiffness_factor(materials) * lengths(K @ (np.diff(a, axis=1) / dt - middle))
-        both = norms.inertia_factor(materials) * M
-        gap, begin = lengths(both @ np.vstack([b, -x / scale])), lengths(both[:, : len(b)] @ b[:, :1])
-        inexact = drift, gap, float(begin[0])
-    return Residual(static @ nodes, lengths(np.linalg.qr(mass, mode="r") @ left), inexact)
+    return Residual(static @ nodes, lengths(np.linalg.qr(mass, mode="r") @ left))
 
 
 def hand_inertia(model: ReducedModel, norms: ResidualNorms) -> tuple[Array, Array]:

@@ -44,8 +44,6 @@ class ResidualNorms:
     n_s: int  # number of degrees of freedom of the hand [1]
     dimension: int  # space dimension d
     omega: tuple[float, float]  # lowest and (a bound on the) highest frequency at the reference [1/s]
-    # triangles of L_q in K_r and of [L_q, L_v] in M_r, for models with inexact kinematics; else None
-    shape: tuple[Array, Array] | None = None
 
     @property
     def k(self) -> int:
@@ -287,13 +285,3 @@ def highest_frequency(system: BlockSystem) -> float:
     finally:
         eps.destroy()
     return float(system.layout.comm.allreduce(value, MPI.MAX))
-
-
-def kinematic_triangles(space: ResidualSpace, L_q: Array, L_v: Array) -> tuple[Array, Array]:
-    """Triangles of L_q in K_r and of [L_q, L_v] in M_r, for :attr:`ResidualNorms.shape`. Collective."""
-    triangles = []
-    for product, columns in ((space.system.K_ee, L_q), (space.system.M_ee, np.hstack([L_q, L_v]))):
-        basis = Orthonormal(space.system, None, product)
-        basis.add(columns)
-        triangles.append(basis.triangle())
-    return triangles[0], triangles[1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,8 +13,7 @@ from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.certified.dual import output_duals
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.motion import FINER, Drive, Materials
-from softgrasp.reduction.certified.residual import ResidualSpace, kinematic_triangles
-from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.certified.residual import ResidualSpace
 from softgrasp.reduction.reduce import project_scene
 
 if TYPE_CHECKING:
@@ -87,25 +85,3 @@ def certified_model(
             space.destroy()
     about.setdefault("drive", scene_drive(model.scene, model.system.M_hand))
     return CertifiedModel(rom, k or Phi.shape[1], norms, compliance, **about)
-
-
-def certified_any(model: Model, rom: ReducedModel, **about: Any) -> CertifiedModel:
-    """A certified model from any reduced one with fixed solid modes relative to the hand. Collective.
-
-    Canonical models and those without structure tie velocities to displacements loosely: their bound is larger.
-
-    Raises:
-        ModelError: the model has no basis on the mesh, or its basis has no certificate.
-    """
-    columns = slice(2 * model.system.layout.n_s, None)
-    assert rom.reconstruction is not None
-    L_q, L_v = (np.asfortranarray(L[:, columns]) for L in (rom.reconstruction.L_q, rom.reconstruction.L_v))
-    space = ResidualSpace(model.system, rom.materials)
-    try:
-        space.extend(L_q)
-        norms = replace(space.norms(), shape=kinematic_triangles(space, L_q, L_v))
-        compliance = space.compliance(model.output_columns)
-    finally:
-        space.destroy()
-    about.setdefault("drive", scene_drive(model.scene, model.system.M_hand))
-    return CertifiedModel(rom, L_q.shape[1], norms, compliance, **about)

@@ -14,9 +14,8 @@ from softgrasp.lqr import BasisGains, Design, GainQuality, LoopMargins, RiccatiS
 from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, gain_change, settled
 from softgrasp.study.forward.result import trajectory_header
 from softgrasp.study.pictures import speed_up
-from softgrasp.study.report import Columns, Section, Table, captioned, entry, table_of
+from softgrasp.study.report import Columns, Page, Section, Table, captioned, entry, table_of
 from softgrasp.study.report.equation import control_equation
-from softgrasp.study.shell import Page
 
 Row = tuple[Any, ...]
 LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal")

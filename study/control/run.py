@@ -19,7 +19,8 @@ from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, r
 from softgrasp.study.control import measure, report
 from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
 from softgrasp.study.pictures import Frames, draw_in_background
-from softgrasp.study.shell import Flags, Page, Session, folder_lock
+from softgrasp.study.report import Page
+from softgrasp.study.shell import Flags, Session, folder_lock
 
 if TYPE_CHECKING:  # observers are not imported where a scene has none
     from softgrasp.study.control.observer.result import ObservedStudy

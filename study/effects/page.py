@@ -14,8 +14,8 @@ from matplotlib.patches import Patch
 from softgrasp.fem import Scene
 from softgrasp.study.effects.result import EffectResult, EffectsStudy
 from softgrasp.study.pictures import BLUE, GREEN, HAND, ORANGE, OUTLINE, WIDTH, paper_style, save
-from softgrasp.study.report import Columns, Section, Table, listed, percent, table_of
-from softgrasp.study.shell import Page, Session
+from softgrasp.study.report import Columns, Page, Section, Table, listed, percent, table_of
+from softgrasp.study.shell import Session
 
 CAPTION = (
     "Each effect switched on against off, the rest of the scene as it is. Left: largest change of the outputs over the "

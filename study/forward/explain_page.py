@@ -11,9 +11,9 @@ from rich.console import Console
 from softgrasp.fem import SMALL_SHARE, SMALL_STRAIN, Forecast, size_text
 from softgrasp.fem.run.forecast import RELIABLE, START
 from softgrasp.study.forward.explain import EffectReport, Explanation, MeshReport, explain
-from softgrasp.study.report import EQUATION, Section, listed, percent
+from softgrasp.study.report import EQUATION, Page, Section, listed, percent
 from softgrasp.study.report.origin import origin
-from softgrasp.study.shell import Page, Session, folder_lock
+from softgrasp.study.shell import Session, folder_lock
 
 OPERATORS = (
     "Operators are matrices and columns over the mesh. `softgrasp effects` adds up the memory of all that a run holds, "

@@ -19,8 +19,8 @@ from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estima
 from softgrasp.study.forward.cautions import looked_at, run_warnings, small_obstacles
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures import Frames, speed_up
-from softgrasp.study.report import Section, captioned, of_scene
-from softgrasp.study.shell import Flags, Page, Session, folder_lock, list_files
+from softgrasp.study.report import Page, Section, captioned, of_scene
+from softgrasp.study.shell import Flags, Session, folder_lock, list_files
 
 CAPTIONS = {
     "move.png": "The body at some instants of the move.",

@@ -7,8 +7,8 @@ from typing import Any
 
 from softgrasp.reduction import NORMS, Certificate, ParameterDomain
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult, answer_rows
-from softgrasp.study.report import Section, Table, captioned, listed, percent
-from softgrasp.study.shell import Page, Session
+from softgrasp.study.report import Page, Section, Table, captioned, listed, percent
+from softgrasp.study.shell import Session
 
 CAPTIONS = {
     "answer.png": "Outputs against the hand with the band that the error bound leaves (often thinner than the line); "

@@ -7,7 +7,10 @@ z = q_e - T q_s against the rigid motion of the hand.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from markupsafe import Markup, escape
 
 from softgrasp.fem import Scene, layered
 
@@ -60,11 +63,41 @@ class Equation:
             lines.append("")
         return [*lines, "with:", *(f"  {text}" for text in self.where)]
 
+    def html(self) -> Markup:
+        """For a page: formulas in MathML, lines that break between terms only."""
+        parts = []
+        for head, part in (("in blocks", self.blocks), ("stepped as", self.stepped), ("controlled by", self.feedback)):
+            parts += [Markup('<p class="head">{}</p>').format(head)] if part else []
+            for name, left, right in part:
+                sides = Markup(" ").join([*terms(left), *terms(right, "=")])
+                parts.append(Markup('<p class="row"><span class="name">{}</span> {}</p>').format(name, sides))
+        parts.append(Markup('<p class="head">with</p>'))
+        parts += [Markup('<p class="where">{}</p>').format(prose(text)) for text in self.where]
+        return Markup('<div class="equation">{}</div>').format(Markup("\n").join(parts))
+
 
 def _plain(text: str) -> str:
     for pattern, shown in PLAIN:
         text = re.sub(pattern, shown, text)
     return text
+
+
+def prose(text: str) -> Markup:
+    """Text with formulas between dollars, as HTML."""
+    from latex2mathml.converter import convert  # brings an HTTP client
+
+    parts = re.split(r"\$(.*?)\$", text)
+    return Markup("").join(Markup(convert(part)) if i % 2 else escape(part) for i, part in enumerate(parts))
+
+
+def terms(side: Sequence[str], first: str = "") -> list[Markup]:
+    """The terms of a side, each behind its sign; a line may break between them."""
+    signs = [first, *("−" if term.startswith("$-") else "+" for term in side[1:])]
+    shown = [side[0], *(f"${term[2:]}" if term.startswith("$-") else term for term in side[1:])]
+    return [
+        Markup('<span class="term">{}</span>').format(prose(f"{sign} {term}".strip()))
+        for sign, term in zip(signs, shown, strict=True)
+    ]
 
 
 def equation(scene: Scene) -> Equation:

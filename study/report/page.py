@@ -5,21 +5,18 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
 from softgrasp.fem import Scene, note, resolved_toml
-from softgrasp.study.report.equation import Equation, equation
+from softgrasp.study.report.document import NUMBERS, Page, Section, cell_text
+from softgrasp.study.report.equation import equation
 from softgrasp.study.report.origin import made_with
-from softgrasp.study.report.typeset import equation_html
-from softgrasp.study.report.words import words_of
 
 TEMPLATE = Path(__file__).with_name("page.html")
 KINDS = {".png": "image/png", ".gif": "image/gif"}
@@ -36,38 +33,29 @@ ADDRESS = re.compile(
     r"""|@import[^;]*|url\(\s*["']?(?!data:)[^)]*""",
     re.IGNORECASE,
 )
-NUMBERS = (int, float, np.integer, np.floating)
 LONG = 24  # [letters]
-SHOWN, MOST_ROWS = 8, 14  # rows of a longer table that stand unfolded
-
-
-@dataclass(frozen=True)
-class Section:
-    """One part of a page; whatever is given is shown in the order of the attributes."""
-
-    title: str  # heading; empty for none
-    text: str = ""  # paragraphs, parted by empty lines
-    code: str = ""  # text shown as it is
-    equation: Equation | None = None  # shown on the page in place of the code
-    header: Sequence[str] = ()  # names of the columns; without it two columns are label and value
-    rows: Sequence[Sequence[Any]] = ()  # a table; every row as long as the header. Numbers are shown with four digits.
-    figures: Sequence[tuple[Path, str]] = ()  # (picture file, caption); the files are embedded
-    terminal: bool = False  # a terminal shows texts and table too
-    best: Sequence[int] = ()  # rows of a long table that stand unfolded; the first ones if there are none
-    details: str = ""  # further paragraphs, folded on the page
-
-    @property
-    def unfolded(self) -> Sequence[Sequence[Any]]:
-        """Rows that stand unfolded on the page, and alone in a terminal."""
-        if not self.header or len(self.rows) <= MOST_ROWS:
-            return self.rows
-        return [self.rows[i] for i in self.best or range(SHOWN)]
-
-
-def captioned(files: Sequence[Path], captions: Mapping[str, str]) -> list[tuple[Path, str]]:
-    """The pictures among some files with their captions, in the order of the captions."""
-    drawn = {file.name: file for file in files}
-    return [(drawn[name], text) for name, text in captions.items() if name in drawn]
+WORDS = {  # what short words mean; a page lists those that it uses
+    "N": "columns of the basis V of a reduced model, those of the hand included; states of the reduced equation",
+    "n_s": "degrees of freedom of the hand: its translations, and its turns where rotation is on",
+    "n_e": "displacements of the tissue that are free: the nodes that the hand does not hold, times the dimension",
+    "2n": "states of the full model: positions and velocities of hand and tissue, 2 (n_s + n_e)",
+    "gate": "the number that decides whether an effect matters: above the stated value it does",
+    "energy drift": "change of the energy that no work or damping explains, over the largest energy of the run",
+    "residual": "what is left of an equation when its solution is put in, relative to its terms",
+    "abscissa": "largest real part of the poles [1/s]; the motion decays where it is negative",
+    "spectral radius": "largest modulus of the poles from tick to tick; the sampled motion decays where it is below 1",
+    "excess cost": "cost of a reduced gain over that of the optimal one, minus 1",
+    "ARE": "the algebraic Riccati equation, whose solution P gives the optimal gain K",
+    "a priori": "a basis chosen from the model alone, before any large equation is solved",
+    "fixed": "fixed solid modes: the hand keeps columns of its own in the basis and is not reduced",
+    "offline": "work done once, before the first reduced run: snapshots, basis, projection",
+    "online": "the steps of a reduced run",
+    "deformation": "displacement of the tissue relative to the rigid motion of the hand",
+    "snapshot": "the state of the full run at one instant, of which bases are built",
+    "box": "the range of lambda and mu that a model was trained for",
+    "proved": "not exceeded, up to rounding; what is estimated is about so large",
+    "tick": "one period of the controller: it measures, computes and holds a force",
+}
 
 
 def of_scene(scene: Scene) -> Section:
@@ -89,57 +77,44 @@ def embed(path: Path) -> str:
 
 def write_report(
     path: Path,
+    page: Page,
     *,
-    title: str,
-    summary: Sequence[str],
-    errors: Sequence[str] = (),
-    warnings: Sequence[str] = (),
-    subtitle: str = "",
-    sections: Sequence[Section] = (),
     scene: Scene | None = None,
-    reproduce: str = "",
     result: Mapping[str, Any] = MappingProxyType({}),
-    numbers: str = "result.json",
     files: Sequence[Path] = (),
+    notes: Sequence[str] = (),
 ) -> Path:
-    """Write the page; what is empty is left out. Not collective: call on one rank.
+    """Write a page; what is empty is left out. Not collective: call on one rank.
 
     Args:
-        summary: sentences that say what came out.
-        errors: sentences on the error of the result; coloured, above the summary.
-        warnings: sentences that a reader must not miss; coloured, below the errors.
         scene: what was run; its equation is added unless a section has it.
-        reproduce: the commands that made this page.
         result: what result.json holds, for sizes and times.
-        numbers: the files beside it that hold its numbers.
         files: what lies beside the page; the page links to it.
+        notes: warnings before those of the page.
 
     Raises ValueError: a row is not as long as its table's header or first row, or the page would load anything.
     """
-    given = list(sections)
+    given = list(page.sections)
     if scene and all(section.title != EQUATION for section in given):
         given.insert(1, of_scene(scene))
-    if reproduce:
+    if page.command:
         given.append(Section("Made with", rows=made_with(result)))
-    page = Environment(autoescape=True, trim_blocks=True, undefined=StrictUndefined).from_string(
+    template = Environment(autoescape=True, trim_blocks=True, undefined=StrictUndefined).from_string(
         TEMPLATE.read_text(encoding="utf-8")
     )
-    prepared = [_prepared(section) for section in given]
+    prepared, warnings = [_prepared(section) for section in given], list(dict.fromkeys([*notes, *page.warnings]))
     parts = (part for s in prepared for part in (s["title"], *s["paragraphs"], *s["details"], *s["header"]))
-    text = " ".join((*errors, *warnings, *summary, *parts))
+    text = " ".join((*page.errors, *warnings, *page.summary, *parts))
     text += " ".join(str(row[0]) for s in prepared for row in s["rows"])
-    html = page.render(
-        title=title,
-        subtitle=subtitle,
-        errors=errors,
+    html = template.render(
+        page=page,
+        subtitle=page.subtitle or (scene.description if scene else ""),
         warnings=warnings,
-        summary=summary,
         sections=prepared,
         words=words_of(text),
         files=[file.relative_to(path.parent).as_posix() for file in files if file.is_relative_to(path.parent)],
         scene="" if scene is None else resolved_toml(scene).strip(),
-        reproduce=reproduce.strip(),
-        how=HOW.format(numbers=numbers),
+        how=HOW.format(numbers=page.numbers or " and ".join(["result.json", *page.tables])),
     )
     if address := outside(html):
         raise ValueError(f"the page needs more than itself: {address[0]}")
@@ -164,7 +139,7 @@ def _prepared(section: Section) -> dict[str, Any]:
         "paragraphs": paragraphs(section.text),
         "details": paragraphs(section.details),
         "code": section.code,
-        "equation": "" if section.equation is None else equation_html(section.equation),
+        "equation": "" if section.equation is None else section.equation.html(),
         "header": section.header,
         "rows": rows,
         "unfolded": [[cell_text(cell) for cell in row] for row in section.unfolded],
@@ -187,17 +162,13 @@ def _column(cells: Sequence[Any]) -> str:
     return "t" if max(map(len, texts)) > LONG else ""
 
 
-def cell_text(cell: Any) -> str:
-    """Text of a cell: numbers with four digits, counts in full, nothing for None."""
-    if cell is None:
-        return ""
-    if isinstance(cell, bool | np.bool_):
-        return "yes" if cell else "no"
-    return f"{cell:.4g}" if isinstance(cell, float | np.floating) else str(cell)
-
-
 def _width(path: Path) -> int:
     """Width of a picture on the page: figures by their size in print, animations by their pixels."""
     with Image.open(path) as image:
         dpi = image.info.get("dpi", (0, 0))[0]
         return round(image.width / dpi * PIXELS_PER_INCH) if dpi and path.suffix == ".png" else image.width
+
+
+def words_of(text: str) -> Sequence[tuple[str, str]]:
+    """The words that a text uses, with their meaning."""
+    return [(word, meaning) for word, meaning in WORDS.items() if re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text)]

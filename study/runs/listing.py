@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shlex
 import time
 import tomllib
 from collections.abc import Iterator
@@ -15,11 +16,9 @@ from rich.console import Console
 
 from softgrasp.fem import SceneError, counted, no_pipe, parse_toml, read_text
 from softgrasp.fem.scene.text import LARGEST
-from softgrasp.study.report import Section, Table, write_json, write_report
-from softgrasp.study.report.origin import command_line
-from softgrasp.study.shell import claim, folder_lock, list_files, read_result
+from softgrasp.study.report import Page, Section, Table
+from softgrasp.study.shell import Session, folder_lock, read_result
 
-SHOWN = 30  # rows of numbers in a terminal; the CSV has all
 ALIKE = 1e-12  # relative difference below which two numbers count as equal: rounding
 LONGEST = 6  # entries of a list that is compared entry by entry
 
@@ -170,47 +169,37 @@ def apart(traces: tuple[list[str], np.ndarray, np.ndarray] | None) -> str:
 
 @folder_lock()
 def run_compare(a: Path, b: Path, out: Path, console: Console, *, pictures: bool = True, empty: bool = False) -> None:
-    """Print how two runs differ, and write compare.csv, result.json and a picture. Not collective.
+    """Print how two runs differ, and write compare.csv, result.json, a picture and a page. Collective.
 
     Raises SceneError: a folder holds no run, or the one to write into holds another.
     """
-    comparison = compare(a, b)
-    claim(out, "compare", f"{a.name} {b.name}", inputs=(a, b), empty=empty)
+    comparison, name = compare(a, b), f"{a.name} {b.name}"
+    session = Session("compare", a, (), out, console, pictures=pictures, empty=empty)
+    session.claim(name, lambda: (a, b))
     keys, numbers = comparison.keys, comparison.numbers
-    for table, none in ((keys, "The scenes are the same."), (numbers, "The numbers are the same.")):
-        shown = Table(table.header, table.rows[:SHOWN]).terminal(wrap=(0, 1, 2), width=console.width)
-        console.print(shown if table.rows else none)
-    if len(numbers.rows) > SHOWN:
-        console.print(f"{len(numbers.rows) - SHOWN} more numbers are in compare.csv")
-    if distance := apart(comparison.traces):
-        console.print(distance)
-    result: dict[str, Any] = {"command": "compare", "scene": f"{a.name} {b.name}", "a": str(a), "b": str(b)}
+    result: dict[str, Any] = {"command": "compare", "scene": name, "a": str(a), "b": str(b)}
     result |= {"keys": [list(row) for row in keys.rows], "numbers": [list(row) for row in numbers.rows]}
-    files = [write_json(out / "result.json", result), numbers.write_csv(out / "compare.csv")]
+    session.write(None, result, lambda: compose(comparison, session, b), clock=False)
+
+
+def compose(comparison: Comparison, session: Session, b: Path) -> Page:
+    """Draw the picture and compose the page."""
+    keys, numbers, traces, a = comparison.keys, comparison.numbers, comparison.traces, session.path
     drawn: tuple[Path, ...] = ()
-    if pictures and (comparison.traces is not None or numbers.rows):
+    if session.pictures and (traces is not None or numbers.rows):
         from softgrasp.study.runs.plots import figure_numbers, figure_two  # brings Matplotlib
 
-        names, file = (a.name, b.name), out / "compare.png"
-        traces = comparison.traces
+        names, file = (a.name, b.name), session.out / "compare.png"
         drawn = figure_numbers(numbers, names, file) if traces is None else figure_two(*traces, names, file)
-    files += drawn
     first = [f"{name} is {x} in A and {y} in B" for name, x, y in keys.rows[:3]]
-    page = write_report(
-        out / "report.html",
-        title=f"{a.name} (A) and {b.name} (B)",
-        summary=[
-            f"{counted(len(keys.rows), 'key')} and {counted(len(numbers.rows), 'number')} of the results differ.",
-            f"{'; '.join(first) or 'The scenes are the same'}.",
-            *([distance] if distance else []),
-        ],
-        sections=[
-            Section("", figures=[(file, "A and B, and their difference.") for file in drawn[:1]]),
-            *([keys.section(title="Keys of the scene")] if keys.rows else []),
-            numbers.section(title="Numbers of result.json"),
-        ],
-        reproduce=command_line("compare", a, [], 1, f" {b}"),
-        numbers="compare.csv and result.json",
-        files=files,
-    )
-    list_files(console, [*files, page])
+    found = f"{counted(len(keys.rows), 'key')} and {counted(len(numbers.rows), 'number')} of the results differ."
+    parts = [
+        Section("", figures=[(file, "A and B, and their difference.") for file in drawn[:1]]),
+        *([keys.section(title="Keys of the scene", terminal=True)] if keys.rows else []),
+        numbers.section(title="Numbers of result.json", terminal=True),
+    ]
+    return Page(
+        f"{a.name} (A) and {b.name} (B)",
+        [found, f"{'; '.join(first) or 'The scenes are the same'}.", *filter(None, [apart(traces)])],
+        parts, {"compare.csv": numbers}, drawn, f" {shlex.quote(str(b))}",
+    )  # fmt: skip

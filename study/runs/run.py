@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem import SceneError
-from softgrasp.study.report import SHOWN, Section, Table
+from softgrasp.study.report import SHOWN, Page, Section, Table
 from softgrasp.study.report.origin import origin
 from softgrasp.study.runs.sweep import METHOD, Sweep, SweepPoint, axis_label, parse_axes, run_sweep_points
-from softgrasp.study.shell import Page, Session, folder_lock
+from softgrasp.study.shell import Session, folder_lock
 
 UNITS = {"energy_drift": "energy drift", "seconds": "time [s]"}
 COARSE = 0.1  # error of the deformation above which a reduced sweep is warned of

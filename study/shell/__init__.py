@@ -6,7 +6,7 @@ from softgrasp._face import face
 
 if TYPE_CHECKING:
     from softgrasp.study.shell.folder import claim, folder_lock, read_result
-    from softgrasp.study.shell.session import Flags, Page, Session, list_files, show_warnings
+    from softgrasp.study.shell.session import Flags, Session, list_files, show_warnings
     from softgrasp.study.shell.timing import (
         RepeatableRun,
         interleave,

@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -19,23 +19,9 @@ from rich.text import Text
 
 from softgrasp.fem import Model, Scene, build, find_scene, load_scene_collective, raise_on_all_ranks
 from softgrasp.fem.owned import follow
-from softgrasp.study.report import Section, Table, show_sections, write_json, write_report, write_scene
+from softgrasp.study.report import Page, Table, show_sections, write_json, write_report, write_scene
 from softgrasp.study.report.origin import command_line
 from softgrasp.study.shell.folder import claim, files_of, read_result, remove_files
-
-
-@dataclass(frozen=True)
-class Page:
-    """One document: what a command prints, and writes beside result.json."""
-
-    title: str
-    summary: Sequence[str]  # three sentences that say what came out
-    sections: Sequence[Section]
-    tables: Mapping[str, Table] = field(default_factory=dict)  # by the name of its CSV file
-    files: Sequence[Path] = ()  # written already: pictures and fields
-    options: str = ""  # of the command line, for the page's last line: " --tolerance 1e-2"
-    errors: Sequence[str] = ()  # sentences on the error of the result
-    warnings: Sequence[str] = ()  # sentences that a reader must not miss
 
 
 class Flags(TypedDict, total=False):
@@ -159,13 +145,13 @@ class Session:
         self.show(content)
         now = time.perf_counter(), sum(os.times()[:4])
         files += [*(table.write_csv(self.out / name) for name, table in content.tables.items()), *content.files]
-        line = command_line(self.command, self.path, self.overrides, self.comm.size, content.options)
-        report = write_report(
-            self.out / "report.html", title=content.title, subtitle=scene.description if scene else "", result=result,
-            sections=content.sections, summary=content.summary, errors=content.errors, files=files, scene=scene,
-            warnings=list(dict.fromkeys([*self.notes, *content.warnings])), reproduce=line,
+        line = content.command or command_line(self.command, self.path, self.overrides, self.comm.size, content.options)
+        files.append(
+            write_report(
+                self.out / "report.html", replace(content, command=line), scene=scene, result=result, files=files,
+                notes=self.notes,
+            )
         )  # fmt: skip
-        files.append(report)
         if clock:
             result.setdefault("time", {}).update(
                 pictures=now[0] - drawing[0], total=time.perf_counter() - self.begin,

@@ -14,9 +14,8 @@ from matplotlib.ticker import MaxNLocator
 from rich.console import Console
 
 from softgrasp.study.pictures.style import BLUE, COLUMN, ORANGE, OUTLINE, WIDTH, paper_style, save
-from softgrasp.study.report.files import write_json
-from softgrasp.study.report.page import Section, write_report
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report import Page, Section, Table
+from softgrasp.study.shell import Session
 from tests.hardcases.cases import Family, FamilyResult, HardCase, HardCaseResult, Outcome, bare_label
 
 WORDS = 30  # letters of an outcome that a column of the report holds
@@ -44,32 +43,27 @@ def show(console: Console, result: FamilyResult) -> None:
     console.print(f"{result.seconds:.1f} s\n")
 
 
-def write_files(out: Path, result: HardCaseResult, family: str | None, pictures: bool) -> list[Path]:
-    """Write result.json, hardcases.csv, one picture a family and report.html."""
+def compose(result: HardCaseResult, family: str | None, session: Session) -> Page:
+    """Draw one picture a family, and compose the page."""
     figures = {
-        f.family.name: figure_family(f.family, f.cases, out / f"hard_{f.family.name}.png")
+        f.family.name: figure_family(f.family, f.cases, session.out / f"hard_{f.family.name}.png")
         for f in result.families
-        if pictures and any(o.value is not None for case in f.cases for o in (case.ours, case.reference))
+        if session.pictures and any(o.value is not None for case in f.cases for o in (case.ours, case.reference))
     }
-    options = (" --quick" if result.quick else "") + (f" --family {family}" if family else "")
-    files = [write_json(out / "result.json", result.to_dict()), csv_table(result).write_csv(out / "hardcases.csv")]
-    files += [file for pair in figures.values() for file in pair]
     cases = [case for f in result.families for case in f.cases]
     kept = [c for c in cases if c.reference.value is not None and (c.bound is None or c.reference.value <= c.bound)]
-    page = write_report(
-        out / "report.html",
-        title="Hard cases",
-        summary=[
+    return Page(
+        "Hard cases",
+        [
             f"{result.summary}.",
             f"The textbook way keeps the same bound in {len(kept)} of them.",
             f"All took {result.seconds:.3g} s.",
         ],
-        sections=sections(result, {name: pair[0] for name, pair in figures.items()}),
-        reproduce=f"python -m tests.hardcases{options}",
-        numbers="result.json and hardcases.csv",
-        files=files,
+        sections(result, {name: pair[0] for name, pair in figures.items()}),
+        {"hardcases.csv": csv_table(result)},
+        [file for pair in figures.values() for file in pair],
+        command="python -m tests.hardcases" + " --quick" * result.quick + (f" --family {family}" if family else ""),
     )
-    return [*files, page]
 
 
 def csv_table(result: HardCaseResult) -> Table:

@@ -11,13 +11,12 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.errors import SoftgraspError
-from softgrasp.study.shell.folder import claim, folder_lock
-from softgrasp.study.shell.session import list_files, progress_bar
-from tests.hardcases import certified, estimates, faults, loops, motion, reduction, riccati, statics
+from softgrasp.study.shell import Session, folder_lock
+from tests.hardcases import certified, contact, estimates, faults, loops, motion, reduction, riccati, statics
 from tests.hardcases.cases import Family, FamilyResult, HardCaseResult
-from tests.hardcases.page import show, write_files
+from tests.hardcases.page import compose, show
 
-MODULES: Any = (statics, estimates, motion, reduction, certified, riccati, loops, faults)
+MODULES: Any = (statics, estimates, motion, contact, reduction, certified, riccati, loops, faults)
 FAMILIES: dict[str, Family] = {family.name: family for module in MODULES for family in module.FAMILIES}
 
 
@@ -53,9 +52,10 @@ def run_hardcases(
     if MPI.COMM_WORLD.size > 1:
         raise SoftgraspError("hardcases starts the ranks that it needs by itself; run it without mpiexec")
     families = choose(family)
-    claim(out, "hardcases", "", empty=empty)
+    session = Session("hardcases", Path(), (), out, console, quiet, pictures, empty)
+    session.claim("", tuple)
     results = []
-    with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:
+    with session.progress(MofNCompleteColumn()) as bar:
         task = bar.add_task("hard cases", total=len(families))
         for chosen in families:
             bar.update(task, description=chosen.title)
@@ -63,8 +63,6 @@ def run_hardcases(
             show(console, results[-1])
             bar.advance(task)
     result = HardCaseResult(tuple(results), quick)
-    out.mkdir(parents=True, exist_ok=True)  # a case that ran in a folder of its own may have given this one back
-    files = write_files(out, result, family, pictures)
-    console.print(result.summary, soft_wrap=True)
-    list_files(console, files)
-    return result.to_dict()
+    found = result.to_dict()
+    session.write(None, found, lambda: compose(result, family, session), clock=False)
+    return found

@@ -9,9 +9,11 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from softgrasp.study.shell import Session
 from tests.hardcases.cases import FamilyResult, HardCase, HardCaseResult, Outcome
-from tests.hardcases.page import write_files
+from tests.hardcases.page import compose
 from tests.hardcases.run import FAMILIES, run_family
 from tests.helpers.browser import look
 
@@ -81,13 +83,16 @@ def test_what_counts_as_a_failure_of_the_textbook_way(textbook: Outcome, bound: 
 def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[HardCaseResult, Path]:
     out = tmp_path_factory.mktemp("hardcases")
     result = HardCaseResult(tuple(quick(name) for name in FAMILIES), quick=True)
-    write_files(out, result, None, pictures=False)
+    session = Session("hardcases", Path(), (), out, Console(quiet=True), pictures=False)
+    session.write(None, result.to_dict(), lambda: compose(result, None, session), clock=False)
     return result, out
 
 
 def test_files_hold_every_case(written: tuple[HardCaseResult, Path]) -> None:
     result, out = written
-    assert json.loads((out / "result.json").read_text()) == result.to_dict()
+    numbers = json.loads((out / "result.json").read_text())
+    assert numbers.pop("files") == ["result.json", "hardcases.csv", "report.html"]
+    assert numbers == result.to_dict()
     with (out / "hardcases.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
     assert len(table) == result.counts["cases"] == sum(len(quick(name).cases) for name in FAMILIES)

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from softgrasp.study.control.observer.result import ObservedStudy
-from softgrasp.study.report.page import Section
-from softgrasp.study.report.tables import listed
+from softgrasp.study.report.document import Section, listed
 
 SAMPLES = ("sample", "standard deviation", "with what the filter leaves out")
 OUTPUTS = ("output", "estimate [m, rad]", "by the full filter [m, rad]", "from the target [m, rad]")

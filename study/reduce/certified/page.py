@@ -11,8 +11,7 @@ import numpy as np
 from softgrasp.reduction import NORMS, CertifiedModel, Validation
 from softgrasp.reduction.certified.greedy import REASONS
 from softgrasp.study.reduce.certified.result import BoxCheck
-from softgrasp.study.report import Columns, Section, Table, captioned, percent, table_of
-from softgrasp.study.shell import Page
+from softgrasp.study.report import Columns, Page, Section, Table, captioned, percent, table_of
 
 CAPTIONS = {
     "certified_box.png": "Error of the reduction over the box, relative to the largest energy norm of the deformation: "

@@ -27,7 +27,8 @@ from softgrasp.study.reduce.certified.measure import REPEATS, check_box
 from softgrasp.study.reduce.certified.page import compose, shown
 from softgrasp.study.reduce.certified.result import BoxCheck
 from softgrasp.study.reduce.result import reduce_result
-from softgrasp.study.shell import Page, Session, median_seconds
+from softgrasp.study.report import Page
+from softgrasp.study.shell import Session, median_seconds
 
 FILE = "certified.h5"
 

@@ -19,8 +19,7 @@ from softgrasp.study.reduce.linear.result import (
     timed_points,
 )
 from softgrasp.study.reduce.tables import TIMES, timed
-from softgrasp.study.report import Columns, Section, Table, captioned, percent, table_of
-from softgrasp.study.shell import Page
+from softgrasp.study.report import Columns, Page, Section, Table, captioned, percent, table_of
 
 LEVELS = (1e-1, 1e-2, 1e-3)  # of the error of the deformation, for which the least N is named
 FIRST = ("errors.png", "errors_beyond.png")  # pictures below the summary

@@ -18,8 +18,7 @@ from softgrasp.study.reduce.strain.result import (
     most_accurate,
 )
 from softgrasp.study.reduce.tables import TIMES, timed
-from softgrasp.study.report import Columns, Section, Table, captioned, percent, table_of
-from softgrasp.study.shell import Page
+from softgrasp.study.report import Columns, Page, Section, Table, captioned, percent, table_of
 
 CAPTIONS = {
     "strain_errors.png": "Error of the deformation z against N, and against the number of sampled cells at some N. "

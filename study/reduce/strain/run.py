@@ -12,7 +12,8 @@ from softgrasp.study.reduce.strain.measure import measure_strain
 from softgrasp.study.reduce.strain.page import compose, sentences
 from softgrasp.study.reduce.strain.result import StrainFamily, StrainStudy
 from softgrasp.study.reduce.times import measured_run
-from softgrasp.study.shell import Page, Session
+from softgrasp.study.report import Page
+from softgrasp.study.shell import Session
 
 
 def run_strain(session: Session, scene: Scene) -> dict[str, Any]:

@@ -19,8 +19,6 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import to_scipy
 from softgrasp.reduction import online
 from softgrasp.reduction.archive import write_checksums
-from softgrasp.reduction.bases.registry import make_basis
-from softgrasp.reduction.bases.states import states_of
 from softgrasp.reduction.certified import bounds
 from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.reduction.certified.certificate import Bound, ToleranceError
@@ -28,8 +26,7 @@ from softgrasp.reduction.certified.model import ParameterDomain
 from softgrasp.reduction.certified.motion import Drive
 from softgrasp.reduction.certified.oscillators import march
 from softgrasp.reduction.certified.residual import ResidualSpace
-from softgrasp.reduction.certified.training import certified_any, certified_model
-from softgrasp.reduction.reduce import project_scene
+from softgrasp.reduction.certified.training import certified_model
 from softgrasp.reduction.system import ModelError
 from tests.helpers.certified import (
     EQUILIBRIUM,
@@ -248,21 +245,6 @@ def test_the_bound_holds_under_a_force(comm: MPI.Intracomm, changes: tuple[Any, 
         assert (run.certificate.outputs.values >= off - ROUNDING * np.abs(full.outputs).max()).all()
 
 
-@pytest.mark.parametrize("method", ["psd_fixed_relative", "psd_cotangent_lift_fixed_relative", "pod_fixed_relative"])
-def test_the_bound_holds_for_bases_without_exact_kinematics(comm: MPI.Intracomm, method: str) -> None:
-    model = build(make_scene(KELVIN_VOIGT), comm=comm)
-    _, full = full_at(model, model.system.materials)
-    rom = project_scene(make_basis(method, states_of(model.system, full.snapshots), 16), model)
-    certified = certified_any(model, rom)
-    for lam, mu in ((50.0, 50.0), (60.0, 45.0)):
-        materials = certified.materials(lam, mu)
-        system, full = full_at(model, materials)
-        run = certified.run(materials, allow=True)
-        error, size = error_to(system, full, certified, run)
-        assert holds(run.certificate.energy.values, error, size)
-        assert run.certificate.energy.values.max() < 3000 * error.max()
-
-
 @pytest.mark.serial
 def test_the_static_bound_is_far_below_the_textbooks(comm: MPI.Intracomm) -> None:
     model = build(make_scene({"tissue": {"cells": [6, 12]}, "time": {"steps": 120}}), comm=comm)
@@ -372,7 +354,7 @@ def test_refusals(comm: MPI.Intracomm) -> None:
         certified.run(drive=Drive(0.1, force=np.zeros((5, 3))))
     with pytest.raises(ModelError, match="either the force"):
         certified.run(drive=Drive(0.1))
-    with pytest.raises(ModelError, match="needs a basis with fixed solid modes"):
+    with pytest.raises(ModelError, match="needs a second-order basis with fixed solid modes"):
         replace(certified, fine=replace(certified.fine, frame="absolute"))
     assert Bound(np.array([0.0, 2.0]), 1.0, "proof").relative == np.inf
 

@@ -44,7 +44,7 @@ from softgrasp.study.effects.run import check_variants, run_effects, study_effec
 from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, neutral, switches
 from softgrasp.study.effects.together import advised, advised_together, finite_strain_beside
 from softgrasp.study.effects.verdict import verdict_of
-from softgrasp.study.report.tables import show_sections
+from softgrasp.study.report.document import show_sections
 from softgrasp.study.shell.timing import RepeatableRun
 from tests.helpers.browser import find_chromium, look
 from tests.helpers.models import LAYERS, close, gather_states, make_scene, write_scene

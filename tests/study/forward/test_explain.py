@@ -26,8 +26,8 @@ from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from softgrasp.study.forward.cautions import inexact, run_warnings
 from softgrasp.study.forward.explain import Explanation, explain
 from softgrasp.study.forward.explain_page import run_explain, sections
+from softgrasp.study.report.document import show_sections
 from softgrasp.study.report.equation import equation
-from softgrasp.study.report.tables import show_sections
 from softgrasp.study.shell.ending import console
 from tests.helpers.models import make_scene
 

@@ -29,7 +29,9 @@ from softgrasp.study.pictures.shapes import (
 )
 from softgrasp.study.pictures.style import save
 from softgrasp.study.pictures.traces import traces
-from softgrasp.study.report.page import Section, write_report
+from softgrasp.study.report.document import Page as Document
+from softgrasp.study.report.document import Section
+from softgrasp.study.report.page import write_report
 from tests.helpers.models import make_scene
 
 pytestmark = pytest.mark.serial  # no communication here
@@ -268,11 +270,9 @@ def test_report_is_one_balanced_page(tmp_path: Path) -> None:
     table = Section(
         "Errors", "First.\n\nSecond <b>.", header=("N", "error", "ok"), rows=[(4, 1.25e-7, True), (6, None, False)]
     )
-    path = write_report(
-        tmp_path / "r.html", title="A & B", summary=["One."], subtitle="s", scene=make_scene(),
-        reproduce="softgrasp reduce x.toml",
-        sections=[Section("", figures=[(png, "caption")]), Section("Short", rows=[("a", 1)]), table],
-    )  # fmt: skip
+    sections = [Section("", figures=[(png, "caption")]), Section("Short", rows=[("a", 1)]), table]
+    document = Document("A & B", ["One."], sections, subtitle="s", command="softgrasp reduce x.toml")
+    path = write_report(tmp_path / "r.html", document, scene=make_scene())
     page = Page(path.read_text())
     assert not page.open
     assert len(page.sources) == 1  # the figure only
@@ -289,7 +289,7 @@ def test_report_is_one_balanced_page(tmp_path: Path) -> None:
     ):
         assert cell in page.cells
     with pytest.raises(ValueError, match="'Bad' has 2 columns"):
-        write_report(tmp_path / "x.html", title="t", summary=(), sections=[Section("Bad", rows=[(1, 2), (1, 2, 3)])])
+        write_report(tmp_path / "x.html", Document("t", (), [Section("Bad", rows=[(1, 2), (1, 2, 3)])]))
 
 
 def test_figures_are_cut_like_matplotlibs_own_tight_ones(tmp_path: Path) -> None:

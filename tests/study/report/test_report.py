@@ -12,10 +12,10 @@ from rich.console import Console
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.run import run_simulate
-from softgrasp.study.report.equation import Equation, control_equation, equation
+from softgrasp.study.report.document import Page, Section
+from softgrasp.study.report.equation import Equation, control_equation, equation, prose, terms
 from softgrasp.study.report.origin import versions
-from softgrasp.study.report.page import Section, outside, write_report
-from softgrasp.study.report.typeset import equation_html, prose, terms
+from softgrasp.study.report.page import outside, write_report
 from tests.helpers.browser import DESK, PHONE, Browser, faults, find_chromium
 
 pytestmark = pytest.mark.serial
@@ -42,7 +42,7 @@ def test_lines_break_before_operators() -> None:
 @pytest.mark.parametrize("kind", [equation, control_equation])
 def test_every_symbol_of_every_scene_is_set(name: str, kind: Callable[[Scene], Equation]) -> None:
     """Nothing of the notation of LaTeX or of text is left in the page: no dollar, backslash, underscore or power."""
-    html = str(equation_html(kind(load_scene(shipped_scenes()[name]))))
+    html = str(kind(load_scene(shipped_scenes()[name])).html())
     assert not any(mark in html for mark in ("_", "$", "^", "\\", "{"))
     assert html.count("<math") == html.count("</math>") > 20
     ET.fromstring(html)  # well formed
@@ -65,7 +65,7 @@ def test_control_has_its_cost_and_riccati_equation(name: str) -> None:
     rows = control_equation(load_scene(shipped_scenes()[name]))
     assert "prescribed" not in " ".join(rows.where)  # a force moves the hand, whatever moves it in `simulate`
     assert any(line.startswith("  hand:   M_hand q_s''") for line in rows.plain().lines())
-    html = str(equation_html(rows))
+    html = str(rows.html())
     assert html.index("Riccati") < html.index(">with<")
 
 
@@ -86,9 +86,7 @@ def test_a_page_that_loads_something_is_seen(mark: str) -> None:
 
 def test_text_about_addresses_is_no_address(tmp_path: Path) -> None:
     assert outside('<p>src=a.png href="x" url(a) @import</p><img src="data:image/png;base64,AA">') == []
-    path = write_report(
-        tmp_path / "r.html", title="t", summary=(), sections=[Section("", "<script src='a.js'></script>")]
-    )
+    path = write_report(tmp_path / "r.html", Page("t", (), [Section("", "<script src='a.js'></script>")]))
     assert "&lt;script" in path.read_text()
 
 
@@ -100,8 +98,8 @@ def test_versions_name_what_the_numbers_come_from() -> None:
 
 def test_the_equation_comes_from_the_scene(tmp_path: Path) -> None:
     scene = load_scene(shipped_scenes()["paper_forward"])
-    page = write_report(tmp_path / "r.html", title="t", summary=(), scene=scene, reproduce="softgrasp").read_text()
-    assert str(equation_html(equation(scene))) in page
+    page = write_report(tmp_path / "r.html", Page("t", (), command="softgrasp"), scene=scene).read_text()
+    assert str(equation(scene).html()) in page
     assert "<h2>Made with</h2>" in page
 
 

@@ -1,11 +1,11 @@
-"""A table once, for the terminal, the page, CSV and Markdown."""
+"""A document once, for the terminal, the page, CSV and Markdown: sections and tables."""
 
 from __future__ import annotations
 
 import csv
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,35 @@ from rich.console import Console
 from rich.markup import escape
 
 from softgrasp.fem import counted, note
-from softgrasp.study.report.page import NUMBERS, Section, cell_text
+from softgrasp.study.report.equation import Equation
 
 Columns = Mapping[str, str | Callable[[Any], Any]]
 """Of each heading, what a row has there: a path of attributes, or a function of the row."""
+NUMBERS = (int, float, np.integer, np.floating)
+SHOWN, MOST_ROWS = 8, 14  # rows of a longer table that stand unfolded
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of a page; whatever is given is shown in the order of the attributes."""
+
+    title: str  # heading; empty for none
+    text: str = ""  # paragraphs, parted by empty lines
+    code: str = ""  # text shown as it is
+    equation: Equation | None = None  # shown on the page in place of the code
+    header: Sequence[str] = ()  # names of the columns; without it two columns are label and value
+    rows: Sequence[Sequence[Any]] = ()  # a table; every row as long as the header. Numbers are shown with four digits.
+    figures: Sequence[tuple[Path, str]] = ()  # (picture file, caption); the files are embedded
+    terminal: bool = False  # a terminal shows texts and table too
+    best: Sequence[int] = ()  # rows of a long table that stand unfolded; the first ones if there are none
+    details: str = ""  # further paragraphs, folded on the page
+
+    @property
+    def unfolded(self) -> Sequence[Sequence[Any]]:
+        """Rows that stand unfolded on the page, and alone in a terminal."""
+        if not self.header or len(self.rows) <= MOST_ROWS:
+            return self.rows
+        return [self.rows[i] for i in self.best or range(SHOWN)]
 
 
 @dataclass(frozen=True)
@@ -74,6 +99,38 @@ class Table:
         for row in self.rows:
             table.add_row(*(escape(cell_text(cell)) for cell in row))
         return table
+
+
+@dataclass(frozen=True)
+class Page:
+    """One document: what a command prints, and writes beside result.json."""
+
+    title: str
+    summary: Sequence[str]  # three sentences that say what came out
+    sections: Sequence[Section] = ()
+    tables: Mapping[str, Table] = field(default_factory=dict)  # by the name of its CSV file
+    files: Sequence[Path] = ()  # written already: pictures and fields
+    options: str = ""  # of the command line, for the page's last line: " --tolerance 1e-2"
+    errors: Sequence[str] = ()  # sentences on the error of the result; coloured, above the summary
+    warnings: Sequence[str] = ()  # sentences that a reader must not miss; coloured, below the errors
+    subtitle: str = ""  # below the title; the description of the scene if there is none
+    command: str = ""  # the line that makes the page again; that of the session if there is none
+    numbers: str = ""  # the files that hold its numbers; result.json and the tables if there are none
+
+
+def captioned(files: Sequence[Path], captions: Mapping[str, str]) -> list[tuple[Path, str]]:
+    """The pictures among some files with their captions, in the order of the captions."""
+    drawn = {file.name: file for file in files}
+    return [(drawn[name], text) for name, text in captions.items() if name in drawn]
+
+
+def cell_text(cell: Any) -> str:
+    """Text of a cell: numbers with four digits, counts in full, nothing for None."""
+    if cell is None:
+        return ""
+    if isinstance(cell, bool | np.bool_):
+        return "yes" if cell else "no"
+    return f"{cell:.4g}" if isinstance(cell, float | np.floating) else str(cell)
 
 
 def number(value: float | None) -> str:
