@@ -36,7 +36,8 @@ softgrasp reduce paper_forward --tolerance 1e-2
 
 0: done, also where --until stopped a run. 1: refused or failed, with one sentence.
 
-2: a wrong option, or a fault of the program. 3: an answer of query is above its tolerance."""
+2: a wrong option, or a fault of the program. 3: an answer is refused: of query above its
+tolerance, of identify by misfit, mesh, time step or an unseen direction."""
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
@@ -162,10 +163,10 @@ def explain(scene: Path, out: Path | None, set_: list[str] | None, empty: bool) 
     run_explain(scene, out, set_ or [], console(), empty=empty)
 
 
-def _run(command: Callable[..., Any], *, scene: Path, out: Path | None, set_: list[str] | None, **options: Any) -> None:
+def _run(command: Callable[..., Any], *, scene: Path, out: Path | None, set_: list[str] | None, **options: Any) -> Any:
     """Run a command on a scene in the folder given or its own; named ``run_NAME``, it is the command NAME."""
     name = command.__name__.removeprefix("run_")
-    command(scene, out or default_folder(name, scene), set_ or [], console(), **options)
+    return command(scene, out or default_folder(name, scene), set_ or [], console(), **options)
 
 
 @app.command(rich_help_panel=RUN)
@@ -291,6 +292,45 @@ def query(
         fallback=fallback, scene=scene, batch=batch, out=csv, folder=out, empty=empty,
     )  # fmt: skip
     raise typer.Exit(status)
+
+
+@app.command(rich_help_panel=MODEL)
+@takes("scene data fit noise offset shift robust refine columns out set_ quiet pictures empty pdf")
+def identify(
+    data: Annotated[
+        list[Path],
+        typer.Argument(
+            help="CSV files, an experiment each: time [s], outputs as tip_x [m], perhaps the hand as q_x [m]"
+        ),
+    ],
+    fit: Annotated[str, typer.Option(help="parameters: mu, lambda, rho, beta; of a layer as skin.mu; with commas")],
+    noise: Annotated[
+        str, typer.Option(help="standard deviation of the measured numbers [m]: 1e-3, or tip=1e-3,mid_x=2e-3")
+    ],
+    offset: Annotated[bool, typer.Option("--offset", help="fit a constant error of each output too")] = False,
+    shift: Annotated[bool, typer.Option("--shift", help="fit a time shift between hand and outputs too")] = False,
+    robust: Annotated[bool, typer.Option("--robust", help="a loss in which outliers count little")] = False,
+    refine: Annotated[
+        bool, typer.Option("--refine", help="refine the mesh and the time step where they exceed the noise")
+    ] = False,
+    columns: Annotated[int, typer.Option(help="dimension of the reduced models; grows where it must", min=6)] = 36,
+    **shared: Any,
+) -> None:
+    """Fit the material of a scene to measurements, with the error of each value by its causes.
+
+    The scene gives the motion of the hand, the outputs and the values to start from; empty cells are missing samples.
+
+    The error has parts by noise, mesh, time step and reduction. fitted.toml is the scene with the values.
+
+    Refused, with exit status 3: a misfit beyond chance, a mesh or time step that changes a value by more than the noise
+    (--refine mends both), a direction that the data do not see.
+
+    Example: softgrasp identify my.toml camera.csv --fit mu,lambda,beta --noise 1e-3
+    """
+    from softgrasp.study.identify.run import run_identify
+
+    raise typer.Exit(_run(run_identify, data=data, fit=fit, noise=noise, offset=offset, shift=shift, robust=robust,
+        refine=refine, columns=columns, **shared))  # fmt: skip
 
 
 @app.command(rich_help_panel=MODEL)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, Unpack, cast
 
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TaskProgressColumn
 
 from softgrasp.fem import Loop, Model, Stopwatch, remove_own, scene_hash
+from softgrasp.fem.solve.stiffness import sharing_factors
 from softgrasp.lqr import A_PRIORI, Design, PlantState, control_of, finite_problem, linearised, with_control
 from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import design
@@ -59,15 +60,17 @@ def run_control(
             exists = session.comm.bcast(restart.exists())
             word = "going on from" if exists else "interrupted, the same command goes on from"
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
-        feedback = design(linearised(model), watch, solver_bar(bar, model), restart)
-        observed = None
-        if control_of(model).observer is not None:  # first: what has no observer is refused at once
-            from softgrasp.study.control.observer.measure import observed_study  # no other scene needs it
+        plant = linearised(model)
+        observed, study = None, cast(GainStudy | None, None)
+        with sharing_factors(plant.system):
+            feedback = design(plant, watch, solver_bar(bar, model), restart)
+            if control_of(model).observer is not None:  # first: what has no observer is refused at once
+                from softgrasp.study.control.observer.measure import observed_study  # no other scene needs it
 
-            observed = observed_study(feedback, watch)
-        if gain_only:
-            study = small_study(feedback, watch, sentence)
-        else:
+                observed = observed_study(feedback, watch)
+            if gain_only:
+                study = small_study(feedback, watch, sentence)
+        if study is None:
             study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence)
             if retune:
                 study = with_retuning(model, study, watch, bar)
@@ -131,7 +134,7 @@ def loop_study(
         reason = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
     else:
         sizes, reason = orders(feedback)
-        with watch.stage("reduced"):
+        with watch.stage("reduced"), sharing_factors(feedback.problem.system):
             bases = measure.timed_gains(feedback, sizes, counted(bar, "reduced equations"))
         with watch.stage("bounds"):
             bases = bases_with_bounds(feedback, bases, duration, counted(bar, "duality gaps"))
