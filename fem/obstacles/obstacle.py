@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.obstacles.shapes import Ball, HalfSpace, Polytope, Shape
 from softgrasp.fem.scene import obstacles as keys
 from softgrasp.fem.scene.scene import Scene
@@ -66,6 +68,39 @@ def mean_normal(shape: Shape, begin: Array, end: Array, straight: float) -> Arra
     normal = np.where(turns[:, None], shape.look((begin + end) / 2)[1], last)
     lacks = np.where(turns, g1 - g0 - np.einsum("ij,ij->i", normal, step), 0.0)
     return np.asarray(normal + (lacks / np.where(turns, square, 1.0))[:, None] * step)
+
+
+def check_passage(
+    obstacles: tuple[Obstacle, ...],
+    before: Array,
+    after: Array,
+    places: tuple[Array, Array],
+    times: tuple[float, float],
+) -> None:
+    """See that no point can pass through an obstacle within a step, which no gap would show.
+
+    Args:
+        obstacles: those of a run.
+        before, after: gaps of the points at both ends of the step, (obstacles, k) [m].
+        places: the points at both ends, (k, d) [m].
+        times: of both ends [s].
+
+    Raises SolverError: a point beside an obstacle moves by more than its thickness.
+    """
+    for obstacle, g0, g1 in zip(obstacles, before, after, strict=True):
+        size = obstacle.shape.size()
+        if math.isinf(size):
+            continue
+        shift = np.asarray(obstacle.shift(times[1])) - obstacle.shift(times[0])
+        way = np.linalg.norm(places[1] - places[0] - shift, axis=1)
+        near = (way > size) & (g0 + np.maximum(g1, 0.0) < way)
+        if near.any():
+            longest = float(way[near].max())
+            raise SolverError(
+                f"obstacle '{obstacle.name}' has a thickness or radius of {size:.2g} m, and from t = {times[0]:.6g} s "
+                f"on a node beside it moves by {longest:.2g} m in one step: it could pass through; take at least "
+                f"{math.ceil(longest / size)} times as many time.steps"
+            )
 
 
 def make_obstacles(scene: Scene, d: int) -> tuple[Obstacle, ...]:

@@ -27,7 +27,7 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.surface import make_surface
 from softgrasp.fem.obstacles import HalfSpace, make_obstacles
-from softgrasp.fem.obstacles.obstacle import mean_normal
+from softgrasp.fem.obstacles.obstacle import check_passage, mean_normal
 from softgrasp.fem.obstacles.responses import Responses
 from softgrasp.fem.obstacles.small import SmallProblem
 from softgrasp.fem.petsc import Array, rows_on_all, total
@@ -125,7 +125,8 @@ class Contact:
     def _gaps(self, x: Array, n: int) -> Array:
         return np.array([o.gap(x, n * self.dt) for o in self.obstacles])
 
-    def _tolerance(self, x: Array) -> float:
+    def tolerance(self, x: Array) -> float:
+        """Rounding of the gaps of points x (p, d) [m]."""
         return ROUNDING * (float(np.abs(x).max(initial=0.0)) + self.layout.extent)
 
     def _make_rows(self, pairs: Ints) -> Rows:
@@ -145,7 +146,7 @@ class Contact:
         self.gaps = self._gaps(x, n)
         self.table.gap[n] = self.gaps.min(axis=1)
         self.rows = self._make_rows(np.zeros((0, 2), dtype=int))
-        if n == 0 and self.gaps.min() < -self._tolerance(x):
+        if n == 0 and self.gaps.min() < -self.tolerance(x):
             o, i = np.unravel_index(self.gaps.argmin(), self.gaps.shape)
             place = ", ".join(f"{c:.4g}" for c in x[i])
             raise SceneError(
@@ -156,16 +157,18 @@ class Contact:
     def press(self, n: int, drive: TableDrive | ForceDrive) -> None:
         """Turn the step without contact in the midpoint into one that leaves no penetration. Collective.
 
-        Raises SolverError: the rounds of the step do not end.
+        Raises SolverError: the rounds of the step do not end, or the step could carry a node through an obstacle.
         """
         self.n, self.drive = n, drive
         self.moved = self._take(self.midpoint.w_array)
         x1 = self.surface.places(drive.q[n + 1], self.z + 2 * self.moved)
         self.after = self._gaps(x1, n + 1)
+        x0 = self.surface.places(drive.q[n], self.z)
+        check_passage(self.obstacles, self.gaps, self.after, (x0, x1), (n * self.dt, (n + 1) * self.dt))
         if self.after.min() >= 0:
             self.rows = self._make_rows(np.zeros((0, 2), dtype=int))
             return
-        f, self.rows = self._settle(n, self.surface.places(drive.q[n], self.z), x1)
+        f, self.rows = self._settle(n, x0, x1)
         self._add(n, f, drive)
         rows, table = self.rows, self.table
         np.add.at(table.force[n], rows.obstacle, rows.x[:, None] * rows.normal)
@@ -175,7 +178,7 @@ class Contact:
 
     def _settle(self, n: int, x0: Array, free: Array) -> tuple[Array, Rows]:
         """Forces of the step, by columns of the responses and by rows, from its free end. Collective."""
-        tol = self._tolerance(free)
+        tol = self.tolerance(free)
         known = self.after < 0
         known[self.rows.obstacle, self.rows.node] = True
         x1, active = free, known & False
@@ -209,28 +212,37 @@ class Contact:
     ) -> tuple[Array, Rows]:
         """Forces with the mean normals between x0 and x1. Collective."""
         rows = self._make_rows(np.argwhere(known))
-        keys = [(int(i), number) for o, i in zip(rows.obstacle, rows.node, strict=True) for number in self.numbers[o]]
-        self.responses.enter(keys)
-        m = self.responses.count
-        C, q = np.zeros((len(rows.node), m)), self.after[rows.obstacle, rows.node] / 2
+        q = self.after[rows.obstacle, rows.node] / 2
         for o, obstacle in enumerate(self.obstacles):
             mine = np.flatnonzero(rows.obstacle == o)
             i = rows.node[mine]
             if isinstance(obstacle.shape, HalfSpace):
                 rows.normal[mine] = obstacle.shape.normal
-                C[mine, [self.responses.where[int(j), self.numbers[o][0]] for j in i]] = 1.0
                 continue
             begin, end = (x[i] - obstacle.shift(t * self.dt) for x, t in ((x0, n), (x1, n + 1)))
             normal = mean_normal(obstacle.shape, begin, end, STRAIGHT * self.layout.extent)
             rows.normal[mine] = normal
             q[mine] = self.gaps[o, i] / 2
             q[mine] += np.einsum("ij,ij->i", normal, free[i] - obstacle.shift((n + 1) * self.dt) - begin) / 2
-            for axis, number in enumerate(self.numbers[o]):
-                C[mine, [self.responses.where[int(j), number] for j in i]] = normal[:, axis]
+        C = self.select(self.responses, np.argwhere(known), rows.normal)
+        m = C.shape[1]
         W = C @ self.responses.G[:m, :m] @ C.T
         self.small.restart(W, np.flatnonzero(active[rows.obstacle, rows.node]))
         rows.x = self.small.solve(len(q), W, q, tol / 4).copy()
         return C.T @ rows.x, rows
+
+    def select(self, responses: Responses, pairs: Ints, normal: Array) -> Array:
+        """Shares (k, m) of all responses in unit forces along normals (k, d) of pairs of obstacle and node, (k, 2).
+
+        Responses that are missing are made. Collective.
+        """
+        keys = [[(int(i), number) for number in self.numbers[o]] for o, i in pairs]
+        responses.enter([key for several in keys for key in several])
+        C = np.zeros((len(pairs), responses.count))
+        for row, several in enumerate(keys):
+            shares = normal[row] if len(several) > 1 else [1.0]
+            C[row, [responses.where[key] for key in several]] = shares
+        return C
 
     def _add(self, n: int, f: Array, drive: TableDrive | ForceDrive) -> None:
         """Take forces f into the step of tissue and hand. Collective."""
@@ -331,7 +343,7 @@ class Contact:
             x = self.held + (self.held_T @ drive.q[n]).reshape(self.held.shape)
             for obstacle in self.obstacles:
                 gap = obstacle.gap(x, n * self.dt).min(initial=0.0)
-                if gap < -self._tolerance(x):
+                if gap < -self.tolerance(x):
                     raise SolverError(
                         f"the hand meets obstacle '{obstacle.name}' at t = {n * self.dt:.6g} s: the nodes that it "
                         f"holds are rigid and {-gap:.2g} m deep in it; change the motion, the obstacle or [contact]"

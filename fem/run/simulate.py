@@ -123,18 +123,25 @@ class Run(Stepped):
             share[n] = z[dofs].sum(axis=0)
 
     def start(self) -> None:
-        """Initial state: at rest, or in equilibrium under gravity. Collective."""
-        scene, system = self.model.scene, self.model.system
-        if scene.time.start == "equilibrium" and system.gravity is not None:
+        """Initial state: undeformed, or in equilibrium. Collective."""
+        if self.model.scene.time.start == "equilibrium":
             with self.model.watch.stage("equilibrium"):
-                name, _ = choose_solver(system.layout, scene.time.solver, few=True)
-                self.state.z.array_w[:] = equilibrium(system, name, scene.time)
+                self.state.z.array_w[:] = self._equilibrium()
         if self.contact is not None:
             self.contact.start(self.state, self.drive.q[0])
         self.midpoint.start(self.state)
         self.record(0)
         self.initial_energy = self.midpoint.energy(self.state)
         self.peak_energy = abs(self.initial_energy)
+
+    def _equilibrium(self) -> Array:
+        """Static displacement against the hand, (n_local,) [m]. Collective."""
+        time, system = self.model.scene.time, self.model.system
+        if self.contact is not None:
+            from softgrasp.fem.run.contact_rest import resting  # only scenes with contact pay for it
+
+            return resting(self.contact, self.drive.q[0], time)
+        return equilibrium(system, choose_solver(system.layout, time.solver, few=True)[0], time)
 
     def take(self, ts: Any, step: int, check: bool = False) -> None:
         """Step up to a number, and see that the forces on the way were finite. Collective.

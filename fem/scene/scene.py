@@ -106,8 +106,9 @@ class Motion(Section):
     drive: Literal["motion", "force"] = Field("motion", description="motion or force is prescribed [no unit]")
     csv: str | None = Field(
         None,
-        description="table, relative to the scene: t [s], then each hand freedom [m, rad], joined by a cubic spline at "
-        "rest at both ends, or with drive = 'force' each load [N, N m], joined by straight lines",
+        description="table, relative to the scene: t [s], then each hand freedom [m, rad] or, in 3D with "
+        "effects.rotation, a pose x, y, z [m] and quaternion w, x, y, z [1], joined by a cubic spline at rest at both "
+        "ends; or with drive = 'force' each load [N, N m], joined by straight lines",
     )
 
     @model_validator(mode="after")
@@ -127,7 +128,7 @@ class Time(Section):
     steps: Annotated[int, Field(ge=1)] = Field(description="number of equal time steps [1], >= 1")
     end: Positive | None = Field(None, description="end time [s]; default motion.duration")
     start: Literal["rest", "equilibrium"] = Field(
-        "rest", description="start undeformed, or in equilibrium under gravity [no unit]"
+        "rest", description="start undeformed, or in equilibrium under gravity and with obstacles [no unit]"
     )
     solver: Literal["auto", "cholesky", "mumps", "cg", "stars"] = Field("auto", description="linear solver [no unit]")
     rtol: Dropped[Annotated[float, Field(gt=0, lt=1)]] = Field(
@@ -273,7 +274,7 @@ class Scene(Shown, Section):
                 "effects.finite_strain cannot go with effects.rotation, whose linearised turns would stretch the "
                 "tissue; set one of them to false"
             )
-        if self.time.start == "equilibrium" and effects.gravity is None:
+        if self.time.start == "equilibrium" and effects.gravity is None and not effects.obstacles:
             raise ValueError("time.start is 'equilibrium' but effects.gravity is off; use 'rest' or give gravity")
         if self.contact.facet_tag is not None and self.tissue.mesh is None:
             raise ValueError("contact.facet_tag needs tissue.mesh; on a structured box give sides or box")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema
+import meshio
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -181,6 +182,39 @@ def test_a_new_scene_runs_and_fits_its_schema(tmp_path: Path, kind: str) -> None
         new_scene(file)
     with pytest.raises(SceneError, match=r"name it my\.toml"):
         new_scene(tmp_path / "my.txt")
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+def test_a_new_scene_reads_the_groups_of_a_mesh(tmp_path: Path, unit: float) -> None:
+    """A strip of 4 cm by 8 cm: muscle below and a core above, a grip on top and a floor; in metres or millimetres."""
+    x, y = np.meshgrid(np.linspace(0, 0.04, 5), np.linspace(0, 0.08, 9))
+    corner = np.arange(40).reshape(8, 5)[:, :4].ravel()
+    cells = np.vstack([np.c_[corner, corner + 1, corner + 6], np.c_[corner, corner + 6, corner + 5]])
+    tags = np.where(y.ravel()[cells].mean(axis=1) > 0.04, 2, 1)
+    low, numbers = np.c_[np.arange(4), np.arange(1, 5)], [np.full(n, i + 1) for i, n in enumerate((32, 32, 4, 4))]
+    mesh = meshio.Mesh(
+        unit * np.c_[x.ravel(), y.ravel(), 0 * x.ravel()],
+        [("triangle", cells[tags == 1]), ("triangle", cells[tags == 2]), ("line", low), ("line", low + 40)],
+        cell_data={"gmsh:physical": numbers, "gmsh:geometrical": numbers},
+        field_data={"muscle": np.array([1, 2]), "core": np.array([2, 2])}
+        | {"floor": np.array([3, 1]), "grip": np.array([4, 1])},
+    )
+    (tmp_path / "meshes").mkdir()
+    meshio.write(tmp_path / "meshes" / "strip.msh", mesh, file_format="gmsh22", binary=False)
+    (tmp_path / "scenes").mkdir()
+    file, _ = new_scene(tmp_path / "scenes" / "my.toml", mesh=tmp_path / "meshes" / "strip.msh")
+    scene = sg.load_scene(file)
+    assert scene.tissue.mesh == "../meshes/strip.msh"  # both folders may move together
+    assert scene.contact.facet_tag == "grip"
+    assert '# other groups: "floor"; or sides and box' in file.read_text()
+    assert {name: layer.tag for name, layer in scene.tissue.layers.items()} == {"muscle": "muscle", "core": "core"}
+    assert scene.tissue.scale == (1.0 if unit == 1.0 else 1e-3)
+    model = sg.build(scene)
+    held = model.system.layout.held
+    assert held.shape == (5, 2)
+    assert np.allclose(held[:, 1], 0.08, atol=1e-9)  # in metres, whatever the file's unit; numbers of text
+    assert len(model.system.layers) == 2  # nothing is outside of both
 
 
 def test_materials_have_sources() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from softgrasp.fem.obstacles import Ball, HalfSpace, Polytope, Shape
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.obstacles import Ball, HalfSpace, Obstacle, Polytope, Shape
+from softgrasp.fem.obstacles.obstacle import check_passage
 
 pytestmark = pytest.mark.ranks(1)  # geometry knows of no ranks
 Array = NDArray[Any]
@@ -111,3 +114,25 @@ def test_touching_and_corners_have_exact_values() -> None:
     ball = Ball(np.zeros(3), 1.0)
     assert ball.look(np.zeros((1, 3)))[0] == -1.0
     assert ball.look(np.zeros((1, 3)))[1].tolist() == [[1, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "words"),
+    [
+        ((-0.5, 0.05), (0.5, 0.05), "at least 10 times as many time.steps"),  # through the ball
+        ((-0.5, 0.4), (0.5, 0.4), ""),  # past it: the ends are farther from it than the way is long
+        ((-0.12, 0.0), (-0.05, 0.0), ""),  # in: the gap shows it
+        ((0.5, 0.0), (0.6, 0.0), ""),
+    ],
+)  # fmt: skip
+def test_a_step_that_could_pass_through_an_obstacle_is_refused(
+    begin: tuple[float, float], end: tuple[float, float], words: str
+) -> None:
+    still = Obstacle("pin", "disc", Ball(np.zeros(2), 0.1), None)
+    way = np.array(end) - begin
+    moving = Obstacle("pin", "disc", Ball(np.zeros(2), 0.1), lambda t, order: -t * way)  # the same seen from the point
+    for obstacle, last in ((still, end), (moving, begin)):
+        places = np.array([begin]), np.array([last])
+        gaps = [np.array([obstacle.gap(x, t)]) for x, t in zip(places, (0.0, 1.0), strict=True)]
+        with pytest.raises(SolverError, match=words) if words else nullcontext():
+            check_passage((obstacle,), gaps[0], gaps[1], places, (0.0, 1.0))

@@ -16,7 +16,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.model.surface import make_surface
 from softgrasp.fem.obstacles.small import SmallProblem
 from softgrasp.fem.petsc import to_scipy
-from softgrasp.fem.run.simulate import RunOptions, simulate
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.scene.file import load_scene
 
 SMALL = [
@@ -132,21 +132,75 @@ def test_momentum_form_equals_the_textbook_step_with_dense_matrices() -> None:
     assert np.abs(ours[1] - v).max() < 1e-6 * np.abs(v).max() + 1e-9
 
 
-@pytest.mark.serial
-def test_rest_state_is_that_of_the_static_obstacle_problem() -> None:
+def rest_of_block(*overrides: str) -> tuple[Any, np.ndarray, np.ndarray]:
+    """The block on the table: model, z and forces of the static problem by nonnegative least squares, all dense."""
     damped = "effects.damping={kind='rayleigh', alpha=4.0, beta=0.05}"
-    model = build("paper_forward", [*SMALL, ON, TABLE, damped, "time.steps=1500", "time.end=30"])
-    result, system = simulate(model), model.system
-    K, surface = to_scipy(system.K_ee).toarray(), make_surface(model.space, system)
-    load = system.G @ system.fall
+    model = build("paper_forward", [*SMALL, ON, TABLE, damped, *overrides])
+    system, surface = model.system, make_surface(model.space, model.system)
+    K, load = to_scipy(system.K_ee).toarray(), system.G @ system.fall
     N = np.zeros((len(surface.X), len(K)))
     N[np.arange(len(N)), surface.rows.reshape(-1, 2)[:, 1]] = 1.0
     W, q = N @ np.linalg.solve(K, N.T), surface.X[:, 1] + 0.03 + N @ np.linalg.solve(K, load)
     L = scipy.linalg.cholesky((W + W.T) / 2, lower=True)
     x, _ = nnls(L.T, -scipy.linalg.solve_triangular(L, q, lower=True))
-    z = np.linalg.solve(K, load + N.T @ x)
-    assert result.contact.force[-1, 0, 1] == pytest.approx(x.sum(), rel=1e-8)  # what is left of the motion after 30 s
-    assert np.abs(np.split(result.final, 2)[0] - z).max() < 1e-8 * np.abs(z).max()
+    on = np.flatnonzero(x)  # nnls solves to about 1e-10: the set is exact, the forces on it are solved for anew
+    x[on] = np.linalg.solve(W[np.ix_(on, on)], -q[on])
+    assert x.min() >= 0
+    assert (q + W @ x).min() > -1e-13
+    return model, np.linalg.solve(K, load + N.T @ x), x
+
+
+@pytest.mark.serial
+def test_rest_state_is_that_of_the_static_obstacle_problem() -> None:
+    model, z, x = rest_of_block("time.steps=1500", "time.end=30")
+    result = simulate(model)
+    # dense and sparse factors: rounding times the condition of K, 1e3
+    assert result.contact.force[-1, 0, 1] == pytest.approx(x.sum(), rel=1e-12)
+    assert np.abs(np.split(result.final, 2)[0] - z).max() < 1e-12 * np.abs(z).max()
+
+
+@pytest.mark.serial
+def test_a_start_in_equilibrium_rests_on_the_table_and_stays() -> None:
+    model, z, x = rest_of_block("time.start='equilibrium'", "time.steps=20")
+    begin = Run(model, RunOptions())
+    begin.start()
+    assert np.abs(begin.state.z.array - z).max() < 1e-12 * np.abs(z).max()
+    begin.midpoint.destroy()
+    after = simulate(model)
+    assert np.abs(np.split(after.final, 2)[0] - z).max() < 1e-12 * np.abs(z).max()
+    assert after.contact.force[:, 0, 1] == pytest.approx(x.sum(), rel=1e-11)
+    assert after.contact.stopped < 1e-20  # nothing moves
+
+
+@pytest.mark.ranks(2)
+@pytest.mark.parametrize("obstacle", [DISC, BOX, SLANTED])
+def test_a_start_in_equilibrium_meets_the_conditions_of_contact(obstacle: str) -> None:
+    deeper = obstacle.replace("-0.53]", "-0.49]").replace("-0.03]", "0.01]").replace("-0.03}", "0.03}")
+    start = Run(build("paper_forward", [*SMALL, ON, deeper, BETA, "time.start='equilibrium'"]), RunOptions())
+    start.start()
+    contact, system = start.contact, start.model.system
+    assert contact is not None
+    surface, z = contact.surface, start.state.z
+    residual = system.K_ee @ z
+    residual.array_w[:] -= system.G @ system.fall
+    force = surface.gather(residual.array_r).reshape(-1, 2)
+    inside = np.array(residual.array_r)
+    inside[surface.rows] = 0
+    scale = np.abs(force).max()
+    assert np.abs(inside).max(initial=0.0) < 1e-12 * scale  # rounding
+    places = surface.places(start.drive.q[0], surface.gather(z.array_r))
+    touched = np.zeros(len(places), dtype=bool)
+    for o in contact.obstacles:
+        gap, normal = o.look(places)
+        assert gap.min() > -1e-14  # rounding of coordinates of size 2
+        touched |= gap < 1e-14
+        if len(contact.obstacles) == 1:
+            along = np.einsum("ij,ij->i", force, normal)
+            assert along.min() > -1e-12 * scale
+            assert np.abs(force - along[:, None] * normal).max() < 1e-11 * scale  # coordinates over radius
+    assert np.abs(force[~touched]).max() < 1e-12 * scale
+    assert touched.sum() > 1
+    start.midpoint.destroy()
 
 
 def test_a_free_hand_rests_with_its_weight_on_the_table() -> None:
