@@ -116,8 +116,8 @@ def slower_naive(table: str, *changes: str) -> float:
 
 
 OBSERVERS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
-    ("four markers", (MARKERS,), 0.02),
     ("four markers, Q = 1e6", (MARKERS, "control.Q=1e6"), 0.02),
+    ("four markers", (MARKERS,), 0.02),
     ("one marker", ("markers=[[0, 0]]",), 0.02),
     ("force alone", ("noise={force=0.01}",), 0.02),
     ("samples one tick late", (f"{MARKERS}, delay=1",), 0.02),
