@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Unpack, cast
+from typing import TYPE_CHECKING, Any, Unpack, cast
 
 import numpy as np
 from rich.console import Console
@@ -22,6 +22,9 @@ from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
 from softgrasp.study.pictures import Frames, draw_in_background
 from softgrasp.study.report import Page
 from softgrasp.study.shell import Flags, Session, folder_lock
+
+if TYPE_CHECKING:  # observers are not imported where a scene has none
+    from softgrasp.study.control.observer.result import ObservedStudy
 
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 
@@ -69,12 +72,11 @@ def run_control(
 
                 observed = observed_study(feedback, watch)
             if gain_only:
-                study = small_study(feedback, watch, sentence)
+                study = replace(small_study(feedback, watch, sentence), observed=observed)
         if study is None:
-            study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence)
+            study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence, observed)
             if retune:
                 study = with_retuning(model, study, watch, bar)
-    study = replace(study, observed=observed)
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
         saved = measure.save_controllers(study, out, end_state(model, study))
@@ -116,7 +118,13 @@ def end_state(model: Model, study: GainStudy) -> PlantState:
 
 
 def loop_study(
-    session: Session, model: Model, feedback: Design, watch: Stopwatch, bar: Progress, note: str
+    session: Session,
+    model: Model,
+    feedback: Design,
+    watch: Stopwatch,
+    bar: Progress,
+    note: str,
+    observed: ObservedStudy | None,
 ) -> tuple[ControlStudy, list[Path], Callable[[], list[Path]]]:
     """All reduced gains and the closed loops. Collective.
 
@@ -128,7 +136,8 @@ def loop_study(
     if control_of(model).constraints is not None:  # first: what has no plan is refused at once
         from softgrasp.study.control.obstacle.measure import planned_study  # no other scene needs it
 
-        planned = planned_study(feedback, watch, counted(bar, "plan on the full plant"))
+        found = None if observed is None else observed.observed
+        planned = planned_study(feedback, watch, counted(bar, "plan on the full plant"), found)
     bases: tuple[BasisGains, ...] = ()
     if feedback.modal:
         reason = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
@@ -148,7 +157,9 @@ def loop_study(
     if finite_strain:
         with watch.stage("finite strain"):
             finite = measure.run_finite(feedback, model, loops.full, duration, counted(bar, "loop of finite strain"))
-    study = ControlStudy(feedback, bases, small.controller, small.tick, notes, loops, finite, planned=planned)
+    study = ControlStudy(
+        feedback, bases, small.controller, small.tick, notes, loops, finite, planned=planned, observed=observed
+    )
     return study, frames.close(), _drawn(session, study, frames)
 
 
