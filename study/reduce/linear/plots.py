@@ -17,7 +17,8 @@ from matplotlib.ticker import MaxNLocator
 
 from softgrasp.reduction import PAPER_METHODS
 from softgrasp.study.pictures import film, gif_bytes, hands_at, style, timing, write_gif
-from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, outline
+from softgrasp.study.pictures.body import colour_bar, draw_scene, make_axes, make_shot, outline
+from softgrasp.study.pictures.shot import Shot
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, by_error, unbeaten
 from softgrasp.study.reduce.linear.views import Views
 
