@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 
 from softgrasp.fem import Array, Ball, HalfSpace, Obstacle, Polytope, Shape
 from softgrasp.study.pictures import shapes
-from softgrasp.study.pictures.shot import Shot
+from softgrasp.study.pictures.shapes import Shot
 from softgrasp.study.pictures.style import HAND, OUTLINE
 
 GREY = "#d9d9d9"
