@@ -14,7 +14,7 @@ from softgrasp.reduction.identify.data import Measurements
 pytestmark = [pytest.mark.serial, pytest.mark.slow]
 SEEDS, WITHIN = 100, 95
 KEEP = "output.snapshots='none'"
-# scene, keys of the fit, keys of the data's finer model, truth over the start, noise [m], every so many steps of the data
+# scene, keys of the fit, those of the data's finer model, truth over the start, noise [m], steps between two data
 SCENES: dict[str, tuple[str, list[str], list[str], dict[str, float], float, int]] = {
     "2D": (
         "paper_forward",
@@ -65,6 +65,5 @@ def test_the_truth_is_within_twice_the_errors(name: str) -> None:
         error = found.values / [values[u.name] for u in found.unknowns] - 1
         far.append(np.abs(error) / found.total)
     within = int((np.array(far) < 2).all(axis=1).sum())
-    print(f"{name}: {within} of {SEEDS} within, refused {refused}, median {np.median(far, axis=0)}")
-    assert within >= WITHIN
+    assert within >= WITHIN, f"{within} of {SEEDS} within, refused {refused}, median {np.median(far, axis=0)}"
     assert refused <= SEEDS // 20  # by the misfit, which chance leaves
