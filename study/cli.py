@@ -335,18 +335,22 @@ def identify(
 
 @app.command(rich_help_panel=MODEL)
 def export(
-    model: Annotated[Path, typer.Argument(help="reduced model that `softgrasp reduce` or sg.save wrote, e.g. rom.h5")],
+    model: Annotated[
+        Path,
+        typer.Argument(help="reduced model of `softgrasp reduce` or sg.save (.h5), or controller of `control` (.npz)"),
+    ],
     c: Annotated[
         Path | None, typer.Option("--c", metavar="FOLDER", help="write C99 with its test into this folder")
     ] = None,
     fmu: Annotated[
         Path | None, typer.Option(help="write a file of FMI 3.0 for Simulink, Modelica and others, e.g. plant.fmu")
     ] = None,
-    tick: Annotated[float, typer.Option(help="time step of the exported model in seconds")] = 1e-3,
+    tick: Annotated[float, typer.Option(help="time step of a model in seconds; a controller has its own")] = 1e-3,
 ) -> None:
-    """Write a reduced model for other programs: C99 for a robot, an FMU for simulators.
+    """Write a reduced model or a controller for other programs: C99 for a robot, an FMU for simulators.
 
-    The load on the hand goes in, hand and outputs of the scene come out; mu, lambda and beta may change at any tick.
+    Of a model, the load on the hand goes in, hand and outputs of the scene come out; mu, lambda and beta may change at
+    any tick. Of a controller, the measured hand and the samples of its observer go in, the load comes out.
 
     The C allocates nothing and calls no library. It brings a log of our own steps, which `make test` compares.
 
