@@ -75,7 +75,7 @@ def doctor() -> None:
 
 @app.command(rich_help_panel=LOOK)
 def scenes() -> None:
-    """List the scenes that ship, with what they show."""
+    """List the scenes that ship, with their descriptions."""
     from rich.table import Table
 
     from softgrasp.fem.scene.file import load_scene, shipped_scenes
@@ -83,7 +83,7 @@ def scenes() -> None:
     shipped = shipped_scenes()
     if not shipped:
         raise SceneError("no scenes here: they ship with the checkout, in demos/scenes")
-    table = Table("scene", "what it shows", box=None, pad_edge=False)
+    table = Table("scene", "description", box=None, pad_edge=False)
     for name, path in shipped.items():
         table.add_row(name, load_scene(path).description)
     console().print(table)
@@ -274,7 +274,7 @@ def query(
     out: Path | None = None,
     empty: bool = False,
 ) -> None:
-    """Ask a certified reduced model for other materials, motions or steps, and how far the answer can be off.
+    """Ask a certified reduced model for other materials, motions or steps; an answer comes with its errors.
 
     An answer has three errors: of the reduction (proved), of the time step and of the mesh (both estimates).
 
