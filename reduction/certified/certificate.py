@@ -9,6 +9,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import percent
 from softgrasp.reduction.online import ReducedTrajectory
 
 Kind = Literal["proof", "estimate"]
@@ -145,13 +146,13 @@ class Certificate:
 
     def sentence(self) -> str:
         """The three numbers in one line."""
-        step = "not known" if self.time_step is None else f"{self.time_step:.1e} (estimate)"
+        step = "not known" if self.time_step is None else f"{percent(self.time_step)} (estimate)"
         mesh = "not known"
         if self.mesh is not None:
             count = len(self.mesh.places)
             where = f"largest of {count} trained materials" if count > 1 else "at one trained material"
-            mesh = f"{self.mesh.largest:.1e} (estimate, {where})"
-        return f"reduction {self.reduction:.1e} ({self.how}) | time step {step} | mesh {mesh}"
+            mesh = f"{percent(self.mesh.largest)} (estimate, {where})"
+        return f"reduction {percent(self.reduction)} ({self.how}) | time step {step} | mesh {mesh}"
 
 
 @dataclass(frozen=True)
