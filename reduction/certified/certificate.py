@@ -33,7 +33,7 @@ class ToleranceError(SoftgraspError):
 class Bound:
     """Error of a run at every step."""
 
-    values: Array = field(repr=False)  # at every step, (steps + 1,) or one column for each component
+    values: Array = field(repr=False)  # bound at every step, (steps + 1,), or (steps + 1, p) of each component
     size: float  # largest value of the reduced solution itself, in the norm of the error
     kind: Kind  # "proof": not exceeded; "estimate": about so large
 
@@ -159,5 +159,5 @@ class Certificate:
 class CertifiedRun:
     """A reduced run and what is known of its error."""
 
-    trajectory: ReducedTrajectory
-    certificate: Certificate
+    trajectory: ReducedTrajectory  # reduced run
+    certificate: Certificate  # its errors

@@ -186,16 +186,23 @@ class ContactModel(Shown):
 
 
 def contact_model(model: Model, modes: int = 10, reach: float | None = None) -> ContactModel:
-    """Reduce a scene with half-spaces, keeping the static responses of the nodes that may touch. Collective.
+    """The tissue in coordinates z = V a, V = [K^-1 G, modes, K^-1 N'] orthonormal in the mass [CB68]. Collective.
 
     Args:
         model: with ``effects.obstacles`` and a hand that does not feel the tissue.
         modes: number of clamped modes beside the responses.
-        reach: rows are kept for boundary nodes that come nearer than this to an obstacle while the undeformed body
+        reach: rows N are kept for boundary nodes that come nearer than this to an obstacle while the undeformed body
             follows the hand of the scene [m]; None: half the distance of boundary nodes. A run in which another node
             enters an obstacle is refused.
 
-    Raises ModelError: the scene has other obstacles, no contact or a two-way hand, or no node comes within reach.
+    Raises:
+        ModelError: the scene has other obstacles, no contact or a two-way hand, or no node comes within reach.
+
+    >>> import softgrasp as sg
+    >>> rom = sg.contact_model(sg.build("set_down", ["tissue.cells=[6, 4]"]), modes=8)
+    >>> run = rom.run(*rom.motion(), rom.dt)
+    >>> rom.N, bool(run.gap.min() > -1e-12)
+    (17, True)
     """
     scene, system = model.scene, model.system
     layout = system.layout
