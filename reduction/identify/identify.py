@@ -143,8 +143,9 @@ def _identify(
                 name: None if error is None else line.inverse @ found.misfit.together(error, found.p)
                 for name, error in errors.items()
             }
+            most = min(LARGEST_N, model.states)
             lost, noise = parts["reduction"], np.sqrt(np.diag(line.covariance))
-            if lost is None or (np.abs(lost) <= noise).all() or N * GROWTH > min(LARGEST_N, model.states):
+            if lost is None or (np.abs(lost) <= noise).all() or most < N * GROWTH:
                 break
             N, start = 2 * int(np.ceil(N * GROWTH / 2)), found.p  # modes come in pairs of states
     return _answer(found, line, first, parts, estimate, N, robust)
