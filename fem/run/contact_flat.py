@@ -88,7 +88,8 @@ class FlatContact(Contact):
         if not self.f.whole:
             self.moved[:] = self._take(self.midpoint.w_array)
         self.q[:] = self.drive.q[n + 1]
-        return ROUNDING * (float(self.c.softgrasp_look(self.f)) + self.layout.extent)
+        self.tol = ROUNDING * (float(self.c.softgrasp_look(self.f)) + self.layout.extent)
+        return self.tol
 
     def press(self, n: int, drive: TableDrive | ForceDrive) -> None:
         """See :meth:`Contact.press`. Collective."""
@@ -164,7 +165,7 @@ class FlatContact(Contact):
         self.reached[0] = self.fastest
         most = self.c.softgrasp_rates(self.f, self.reached)
         self.fastest = self.reached[0]
-        if most > STILL * self.fastest:
+        if most > max(STILL * self.fastest, self.s * self.tol):
             rows = self._pressed_rows()
             self._strike(state, n, rows, rows.normal, self.stops[: len(rows.node)])
 
