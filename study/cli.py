@@ -36,7 +36,8 @@ softgrasp reduce paper_forward --tolerance 1e-2
 
 0: done, also where --until stopped a run. 1: refused or failed, with one sentence.
 
-2: a wrong option, or a fault of the program. 3: an answer of query is above its tolerance."""
+2: a wrong option, or a fault of the program. 3: an answer is refused: of query above its
+tolerance, of identify by misfit, mesh, time step or an unseen direction."""
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
@@ -162,10 +163,10 @@ def explain(scene: Path, out: Path | None, set_: list[str] | None, empty: bool) 
     run_explain(scene, out, set_ or [], console(), empty=empty)
 
 
-def _run(command: Callable[..., Any], *, scene: Path, out: Path | None, set_: list[str] | None, **options: Any) -> None:
+def _run(command: Callable[..., Any], *, scene: Path, out: Path | None, set_: list[str] | None, **options: Any) -> Any:
     """Run a command on a scene in the folder given or its own; named ``run_NAME``, it is the command NAME."""
     name = command.__name__.removeprefix("run_")
-    command(scene, out or default_folder(name, scene), set_ or [], console(), **options)
+    return command(scene, out or default_folder(name, scene), set_ or [], console(), **options)
 
 
 @app.command(rich_help_panel=RUN)
@@ -294,19 +295,62 @@ def query(
 
 
 @app.command(rich_help_panel=MODEL)
+@takes("scene data fit noise offset shift robust refine columns out set_ quiet pictures empty pdf")
+def identify(
+    data: Annotated[
+        list[Path],
+        typer.Argument(
+            help="CSV files, an experiment each: time [s], outputs as tip_x [m], perhaps the hand as q_x [m]"
+        ),
+    ],
+    fit: Annotated[str, typer.Option(help="parameters: mu, lambda, rho, beta; of a layer as skin.mu; with commas")],
+    noise: Annotated[
+        str, typer.Option(help="standard deviation of the measured numbers [m]: 1e-3, or tip=1e-3,mid_x=2e-3")
+    ],
+    offset: Annotated[bool, typer.Option("--offset", help="fit a constant error of each output too")] = False,
+    shift: Annotated[bool, typer.Option("--shift", help="fit a time shift between hand and outputs too")] = False,
+    robust: Annotated[bool, typer.Option("--robust", help="a loss in which outliers count little")] = False,
+    refine: Annotated[
+        bool, typer.Option("--refine", help="refine the mesh and the time step where they exceed the noise")
+    ] = False,
+    columns: Annotated[int, typer.Option(help="dimension of the reduced models; grows where it must", min=6)] = 36,
+    **shared: Any,
+) -> None:
+    """Fit the material of a scene to measurements, with the error of each value by its causes.
+
+    The scene gives the motion of the hand, the outputs and the values to start from; empty cells are missing samples.
+
+    The error has parts by noise, mesh, time step and reduction. fitted.toml is the scene with the values.
+
+    Refused, with exit status 3: a misfit beyond chance, a mesh or time step that changes a value by more than the noise
+    (--refine mends both), a direction that the data do not see.
+
+    Example: softgrasp identify my.toml camera.csv --fit mu,lambda,beta --noise 1e-3
+    """
+    from softgrasp.study.identify.run import run_identify
+
+    raise typer.Exit(_run(run_identify, data=data, fit=fit, noise=noise, offset=offset, shift=shift, robust=robust,
+        refine=refine, columns=columns, **shared))  # fmt: skip
+
+
+@app.command(rich_help_panel=MODEL)
 def export(
-    model: Annotated[Path, typer.Argument(help="reduced model that `softgrasp reduce` or sg.save wrote, e.g. rom.h5")],
+    model: Annotated[
+        Path,
+        typer.Argument(help="reduced model of `softgrasp reduce` or sg.save (.h5), or controller of `control` (.npz)"),
+    ],
     c: Annotated[
         Path | None, typer.Option("--c", metavar="FOLDER", help="write C99 with its test into this folder")
     ] = None,
     fmu: Annotated[
         Path | None, typer.Option(help="write a file of FMI 3.0 for Simulink, Modelica and others, e.g. plant.fmu")
     ] = None,
-    tick: Annotated[float, typer.Option(help="time step of the exported model in seconds")] = 1e-3,
+    tick: Annotated[float, typer.Option(help="time step of a model in seconds; a controller has its own")] = 1e-3,
 ) -> None:
-    """Write a reduced model for other programs: C99 for a robot, an FMU for simulators.
+    """Write a reduced model or a controller for other programs: C99 for a robot, an FMU for simulators.
 
-    The load on the hand goes in, hand and outputs of the scene come out; mu, lambda and beta may change at any tick.
+    Of a model, the load on the hand goes in, hand and outputs of the scene come out; mu, lambda and beta may change at
+    any tick. Of a controller, the measured hand and the samples of its observer go in, the load comes out.
 
     The C allocates nothing and calls no library. It brings a log of our own steps, which `make test` compares.
 

@@ -24,7 +24,8 @@ from tests.hardcases.__main__ import app as hardcases_app
 pytestmark = pytest.mark.serial
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-MESHED = ("pillow_3d", "paper_accurate", "franka_muscle", "layers_2d", "strip.toml", "block.toml")  # cells of their own
+# with cells of their own
+MESHED = ("pillow_3d", "set_down_3d", "paper_accurate", "franka_muscle", "layers_2d", "strip.toml", "block.toml")
 SMALL: dict[str, tuple[str, ...]] = {  # keys that make a command cheap; a later one wins
     "simulate": ("time.steps=20", "output.frames=4"),
     "sweep": ("time.steps=20", "output.frames=4"),

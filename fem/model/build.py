@@ -17,7 +17,7 @@ from mpi4py import MPI
 from softgrasp.fem.effects.damping import operator as damping_operator
 from softgrasp.fem.effects.gravity import acceleration
 from softgrasp.fem.effects.rotation import hand_mass
-from softgrasp.fem.errors import SceneError, shortened
+from softgrasp.fem.errors import SceneError, raise_on_all_ranks, shortened
 from softgrasp.fem.material import LayerMaterial, in_words
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.mesh.scene_hash import scene_hash, scene_keys
@@ -30,6 +30,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.materials import lame
 from softgrasp.fem.scene.scene import Scene, check_dimension
+from softgrasp.fem.scene.table import read_motion
 from softgrasp.fem.shown import Card, Shown, listed
 from softgrasp.fem.system import BlockSystem, LayerBlocks, coupling, tissue_matrices
 
@@ -258,6 +259,9 @@ def build(
         mesh = mesh or make_mesh(comm, scene)
     d = mesh.dimension
     check_dimension(scene, d)  # of a mesh file it was unknown before
+    if scene.motion.csv is not None:
+        with raise_on_all_ranks(comm):  # here, so that a wrong file ends nothing that takes long
+            read_motion(scene, d + scene.effects.rotation * d * (d - 1) // 2)
     if not boxed:
         check_memory(scene, comm, run, d, mesh.mesh.topology.index_map(d).size_global)
     with watch.stage("assembly"):

@@ -14,7 +14,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.scene.table import read_csv
+from softgrasp.fem.scene.table import read_motion
 from softgrasp.fem.system import BlockSystem
 
 
@@ -56,7 +56,7 @@ class Profile:
         target = np.array(motion.target or [], dtype=float)
         table = None
         if motion.profile == "csv":
-            table = read_csv(scene.directory / (motion.csv or ""), n_s, end)
+            table = read_motion(scene, n_s)
         return Profile(motion.drive, end, np.pad(target, (0, n_s - len(target))), motion.duration, table)
 
     @property

@@ -189,6 +189,11 @@ class Constraints(Section):
         description="what the reduced plant may leave out at every node [m]; bound: the exact l1 bound for all forces "
         "within ``force``",
     )
+    noise: NonNegative = Field(
+        3.0,
+        description="with control.observer: standard deviations of every node, and of the force, that gaps and limit "
+        "keep as a further margin [1]",
+    )
     N: Annotated[int, Field(ge=8)] = Field(
         22, description="states of the reduced plant of the plan, those of the hand included [1], even"
     )

@@ -106,8 +106,9 @@ class Motion(Section):
     drive: Literal["motion", "force"] = Field("motion", description="motion or force is prescribed [no unit]")
     csv: str | None = Field(
         None,
-        description="table, relative to the scene: t [s], then each hand freedom [m, rad], joined by a cubic spline at "
-        "rest at both ends, or with drive = 'force' each load [N, N m], joined by straight lines",
+        description="table, relative to the scene: t [s], then each hand freedom [m, rad] or, in 3D with "
+        "effects.rotation, a pose x, y, z [m] and quaternion w, x, y, z [1], joined by a cubic spline at rest at both "
+        "ends; or with drive = 'force' each load [N, N m], joined by straight lines",
     )
 
     @model_validator(mode="after")

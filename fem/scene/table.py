@@ -9,7 +9,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.text import read_table
+
+TURNING, POSE = 6, 7  # values in a row: displacement and angles in 3D; place and quaternion
+NORM = 1e-3  # deviation of a quaternion's norm from one that digits of a file explain; a wrong column is further off
+
+
+def read_motion(scene: Scene, n_s: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Times (m,) [s] and motion of the hand or force on it, (m, n_s) [m, rad; N, N m], from ``motion.csv``.
+
+    In 3D with ``effects.rotation`` a row may be a pose: place x, y, z of the hand's reference point and quaternion
+    w, x, y, z. The motion is that from the pose of the first row.
+
+    Raises SceneError: the file does not fit.
+    """
+    name = scene.motion.csv or ""
+    posed = n_s == TURNING and scene.motion.drive == "motion"
+    times, values = read_csv(
+        scene.directory / name, n_s, scene.time_end, also=POSE if posed else None,
+        meaning="one per hand degree of freedom" + ", or x, y, z and a quaternion w, x, y, z" * posed,
+    )  # fmt: skip
+    return times, values if values.shape[1] == n_s else _from_poses(values, f"motion.csv: {scene.directory / name}")
+
+
+def _from_poses(poses: NDArray[Any], name: str) -> NDArray[Any]:
+    """Displacement and rotation vector (m, 6) [m, rad] from the first of the poses (m, 7)."""
+    from scipy.spatial.transform import Rotation  # poses alone pay for it
+
+    norms = np.linalg.norm(poses[:, 3:], axis=1)
+    worst = int(np.argmax(np.abs(norms - 1)))
+    if abs(norms[worst] - 1) > NORM:
+        raise SceneError(
+            f"{name} has a quaternion of norm {norms[worst]:.4g} in data row {worst + 1}; it must be 1, in the order "
+            "w, x, y, z"
+        )
+    turns = Rotation.from_quat(poses[:, [4, 5, 6, 3]])
+    return np.hstack([poses[:, :3] - poses[0, :3], (turns * turns[0].inv()).as_rotvec()])
 
 
 def read_csv(
@@ -18,19 +54,21 @@ def read_csv(
     end: float | None = None,
     key: str = "motion.csv",
     meaning: str = "one per hand degree of freedom",
+    also: int | None = None,
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Read times (steps,) and values (steps, columns) of a trajectory.
+    """Read times (steps,) and values (steps, columns or also) of a trajectory.
 
     Args:
         columns: values in a row beside the time.
         end: of the run [s]; None: the time of the last row.
         key: who names the file, for the messages.
         meaning: what the columns are, for the messages.
+        also: another number of values in a row that is accepted.
 
     Raises SceneError: the file is missing, not numeric, not increasing in time or does not cover [0, end].
     """
     try:
-        table = np.array(read_table(path, columns + 1))
+        table = np.array(read_table(path, *(1 + count for count in (columns, also) if count is not None)))
     except OSError as error:
         raise SceneError(f"{key}: {path} cannot be read ({error.strerror}); name an existing CSV file") from error
     except ValueError as error:

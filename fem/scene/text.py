@@ -106,12 +106,12 @@ def out_of_range(value: float) -> str:
     return f"numbers that are 0 or of size {SMALLEST:g} to {LARGEST:g}"
 
 
-def read_table(path: Path, columns: int) -> list[list[float]]:
+def read_table(path: Path, *columns: int) -> list[list[float]]:
     """The rows of numbers of a CSV file; a line of names may come first, comments start with #.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no table of finite numbers with these columns, as the rest of a sentence about it.
+        ValueError: it is no table of finite numbers with one of these numbers of columns, as the rest of a sentence.
     """
     try:
         lines = [row for row in csv.reader(io.StringIO(read_text(path))) if row and not row[0].lstrip().startswith("#")]
@@ -125,8 +125,9 @@ def read_table(path: Path, columns: int) -> list[list[float]]:
             if i == 0 and not _number(line[0]):
                 continue
             raise ValueError(f"has a value that is not a number in data row {len(rows) + 1} ({error})") from None
-        if len(row) != columns:
-            raise ValueError(f"has {len(row)} entries in data row {len(rows) + 1}; it must have {columns} columns")
+        if len(row) not in columns or (rows and len(row) != len(rows[0])):
+            must = f"{len(rows[0])}" if rows else " or ".join(map(str, columns))
+            raise ValueError(f"has {len(row)} entries in data row {len(rows) + 1}; it must have {must} columns")
         for j, value in enumerate(row):
             if bounds := ("finite numbers" if not math.isfinite(value) else out_of_range(value)):
                 place = "the time" if j == 0 else f"column {j + 1}, at t = {row[0]:g} s,"

@@ -8,9 +8,9 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, PETSc
+from softgrasp.fem.petsc import Array, PETSc, from_options
 from softgrasp.fem.scene.scene import Time
-from softgrasp.fem.solve.solvers import SolverName, choose_solver, make_solver
+from softgrasp.fem.solve.solvers import SolverName, TissueSolver, choose_solver, make_solver
 from softgrasp.fem.solve.stiffness import factored_stiffness
 from softgrasp.fem.system import BlockSystem
 
@@ -54,6 +54,29 @@ def solve_columns(
         static.destroy()
 
 
+def mass_columns(system: BlockSystem, X: Array) -> Array:
+    """Return the local rows (n_local, k) of M_ee^-1 X, Fortran order. Collective.
+
+    By CG with the diagonal, whose iterations grow neither with the mesh nor where nodes crowd [W87]. Raises
+    SolverError: it does not converge.
+    """
+    M = system.M_ee
+    ksp = PETSc.KSP().create(M.comm)
+    ksp.setOptionsPrefix("softgrasp_mass_")
+    ksp.setOperators(M)
+    ksp.setType("cg")
+    ksp.getPC().setType("jacobi")
+    ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+    ksp.setTolerances(rtol=MASS_RTOL, atol=1e-300, max_it=1000)
+    from_options(ksp)
+    solver = TissueSolver("cg", ksp, M.copy(), 10 * MASS_RTOL)
+    try:
+        return solver.columns(X, "a momentum")
+    finally:
+        solver.destroy()
+
+
+MASS_RTOL = 1e-12  # relative residual [1]: near rounding, which a factor would reach
 SMALLEST = 2.0**-10  # step of the load, and part of a correction
 MOST = 25  # iterations of a load
 TOL = 1e-11  # |f - t G g| over |G g|

@@ -1,8 +1,8 @@
-"""K_ee factored once for all that need it: equilibrium, sag, modes, estimate of the mesh."""
+"""Factors made once for all that need them: K_ee for equilibrium, sag, modes, mesh estimate; K + s D + s^2 M."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -23,6 +23,46 @@ if TYPE_CHECKING:
 # Unknowns up to which the factor stays with the system, beside that of the steps: about 0.5 GiB in 2D and 1 GiB in 3D.
 KEPT_LIMIT = {1: 400_000, 2: 400_000, 3: 100_000}
 PREFIX = "softgrasp_stiffness_"
+SHARED = "shared factors"  # key of those in system.kept, by name with what they belong to
+
+
+@contextmanager
+def sharing_factors(system: BlockSystem) -> Iterator[None]:
+    """Factors made inside stay with the system to the end of the block, of any size and on any ranks. Collective."""
+    if SHARED in system.kept:
+        yield
+        return
+    shared: dict[str, tuple[object, TissueSolver]] = {}
+    system.kept[SHARED] = shared
+    try:
+        yield
+    finally:
+        del system.kept[SHARED]
+        for _, solver in shared.values():
+            solver.destroy()
+
+
+@contextmanager
+def shared_factor(
+    system: BlockSystem, name: str, key: object, make: Callable[[], TissueSolver]
+) -> Iterator[TissueSolver]:
+    """The last solver of a name if its key is this one; else a new one, freed at the end unless shared. Collective."""
+    shared = system.kept.get(SHARED)
+    old = None if shared is None else shared.get(name)
+    if old is not None and old[0] == key:
+        yield old[1]
+        return
+    if shared is not None and old is not None:
+        del shared[name]
+        old[1].destroy()
+    made = make()
+    if shared is not None:
+        shared[name] = key, made
+    try:
+        yield made
+    finally:
+        if shared is None:
+            made.destroy()
 
 
 @contextmanager
@@ -48,18 +88,19 @@ def factored_stiffness(
     if kept is not None and kept[0] == key:
         yield kept[1]
         return
-    made = make_solver(K.copy(), name, layout, PREFIX, rtol, reproducible)
+
+    def make() -> TissueSolver:
+        return make_solver(K.copy(), name, layout, PREFIX, rtol, reproducible)
+
     # a factor spread over ranks is freed by all of them at once, which the end of a system cannot promise
     if layout.n_e <= KEPT_LIMIT[layout.dimension] and (everywhere or layout.comm.size == 1):
         if kept is not None:
             kept[1].destroy()
-        system.kept["factor"] = key, made, K  # no other matrix can get the handle of one that is referenced
-        yield made
+        system.kept["factor"] = key, make(), K  # no other matrix can get the handle of one that is referenced
+        yield system.kept["factor"][1]
         return
-    try:
-        yield made
-    finally:
-        made.destroy()
+    with shared_factor(system, "stiffness", key, make) as factor:
+        yield factor
 
 
 def static_columns(system: BlockSystem, X: Array) -> Array:

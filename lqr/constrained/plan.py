@@ -46,6 +46,7 @@ class Task:
     error: Array  # margin for what the reduced plant leaves out at every node [m], (nodes, 2)
     clearance: float = 0.0  # distance to keep beyond that [m]
     limits: Limits = field(default_factory=Limits)  # of the hand
+    noise: Array | float = 0.0  # margin for what noise moves every node [m], (nodes, 2) or 0
     bounded: bool = True  # whether ``error`` is a proved bound
     penalty: float | None = None  # cost of a metre inside an obstacle [1/m]; None: :data:`PRICE` times that of the way
 
@@ -196,7 +197,7 @@ def _at_target(task: Task) -> list[tuple[Array, Array]]:
 def _free(shape: Shape, task: Task, normals: Array) -> Array:
     """Way of every node at the target to the half-planes of an obstacle, less clearance and margin, (count, nodes)."""
     off = normals @ task.places.T - supports(shape, normals)[:, None]
-    return np.asarray(off - task.clearance - np.abs(normals) @ task.error.T)
+    return np.asarray(off - task.clearance - np.abs(normals) @ (task.error + task.noise).T)
 
 
 def _cheapest(horizon: Horizon, task: Task, level: float) -> Plan:

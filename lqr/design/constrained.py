@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
@@ -15,12 +16,17 @@ from softgrasp.lqr.constrained.horizon import held_plant
 from softgrasp.lqr.constrained.plan import Plan, Task, make_plan
 from softgrasp.lqr.constrained.pulse import PulseError
 from softgrasp.lqr.constrained.rows import Limits
-from softgrasp.lqr.constrained.run import PlanRuns, run_plan
-from softgrasp.lqr.constrained.tissue import Surface, make_surface, modal_tissue
+from softgrasp.lqr.constrained.run import STEPS, PlanRuns, run_plan
+from softgrasp.lqr.constrained.separation import separate
+from softgrasp.lqr.constrained.tissue import ModalTissue, Surface, make_surface, modal_tissue
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.scene import control_of, problem
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem
+
+if TYPE_CHECKING:  # observers are not imported where a scene has none
+    from softgrasp.lqr.design.observer import ObservedControl
+    from softgrasp.lqr.observer.tube import Tube
 
 SETTLED = 5.0  # time constants of the hand alone that the first horizon lasts: 0.7 % of the way are left
 AT_REST = 1e-9  # of the body: a start so near to equilibrium is one
@@ -38,6 +44,8 @@ class PlannedControl:
     """Nodes of the body on its boundary."""
     names: tuple[str, ...]
     """Of the obstacles."""
+    tube: PlannedTube | None = None
+    """Feedback around the plan with noise; None where the scene has no observer."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +59,33 @@ class PlanSizes:
     rows: int  # gaps of all nodes at all instants, and limits
 
 
-def plan_control(design: Design, watch: Stopwatch, notify: Callable[[int, int], None] | None = None) -> PlannedControl:
+@dataclass(frozen=True)
+class PlannedTube:
+    """A plan with feedback from samples around it, under noise and disturbances."""
+
+    tube: Tube
+    """What a robot runs."""
+    covariance: Array
+    """Of the place of every node around its way [m2], (nodes, d, d)."""
+    times: Array
+    """Instants of the noisy run that are kept [s], (count,)."""
+    gaps: Array
+    """Distance of body and obstacle in that run, negative where they overlap [m], (count, obstacles)."""
+
+
+def plan_control(
+    design: Design,
+    watch: Stopwatch,
+    notify: Callable[[int, int], None] | None = None,
+    observed: ObservedControl | None = None,
+) -> PlannedControl:
     """Plan past the obstacles of a scene, within its limits, and run it on the full plant. Collective.
 
     Args:
         design: the optimal feedback of the scene.
         watch: records the seconds of "bound", "plan" and "plan run".
         notify: called with the number of steps of the full plant done and in all.
+        observed: the observer of the scene, whose feedback keeps the plant near to the plan.
 
     Raises:
         ControlError: the plant has no plan, the target keeps no gap or limit, or a key is missing.
@@ -78,6 +106,7 @@ def plan_control(design: Design, watch: Stopwatch, notify: Callable[[int, int], 
             most = np.abs(np.linalg.inv(plant.M_s)) @ (_force(limits) + np.abs(design.target.u))
             pulses = PulseError(tissue, reduced, given.grid)
             error = on_root(plant.layout.comm, lambda: pulses.bound(most))
+        noise, limits = _noise(given.noise, observed, tissue, limits)
     with watch.stage("plan"):
         on_grid = held_plant(plant, reduced, given.grid, given.parts)
         begin = np.zeros(on_grid.N)
@@ -85,14 +114,57 @@ def plan_control(design: Design, watch: Stopwatch, notify: Callable[[int, int], 
         shapes, names = tuple(o.shape for o in obstacles), tuple(o.name for o in obstacles)
         penalty = None if given.penalty == "auto" else float(given.penalty)
         target = _places(plant, surface, design)
-        bounded = given.margin == "bound"
-        task = Task(begin, target, design.target.u, shapes, names, error, given.clearance, limits, bounded, penalty)
+        task = Task(
+            begin, target, design.target.u, shapes, names, error, given.clearance, limits, noise,
+            given.margin == "bound", penalty,
+        )  # fmt: skip
         steps = first_horizon(design.model, plant)
         longest = None if given.horizon == "auto" else steps
         plan = on_root(plant.layout.comm, lambda: make_plan(on_grid, task, steps, longest))
     with watch.stage("plan run"):
         runs = run_plan(plant, design.solution, plan, surface, tissue, design.start, design.target, notify)
-    return PlannedControl(plan, runs, surface, names)
+    tube = None
+    if observed is not None:
+        with watch.stage("tube"):
+            tube = on_root(plant.layout.comm, lambda: _tube(plan, observed, tissue))
+    return PlannedControl(plan, runs, surface, names, tube)
+
+
+def _noise(
+    deviations: float, observed: ObservedControl | None, tissue: ModalTissue, limits: Limits
+) -> tuple[Array | float, Limits]:
+    """Margin of every node for noise [m], and the limits with room for it.
+
+    Raises ControlError: the force has none.
+    """
+    if observed is None:
+        return 0.0, limits
+    from softgrasp.lqr.observer.tube import node_covariance, node_rows
+
+    judged = observed.judged
+    covariance = node_covariance(node_rows(tissue, len(judged.sd_inputs)), judged)
+    sd = np.sqrt(np.maximum(np.einsum("jdd->jd", covariance), 0.0))
+    if limits.force is not None:
+        force = limits.force - deviations * judged.sd_inputs
+        if not force.min() > 0:
+            raise ControlError(
+                f"{deviations:g} standard deviations of the force, {deviations * judged.sd_inputs.max():.3g} N, leave "
+                "nothing of control.constraints.force; raise it, or lower control.constraints.noise"
+            )
+        limits = replace(limits, force=force)
+    return deviations * sd, limits
+
+
+def _tube(plan: Plan, observed: ObservedControl, tissue: ModalTissue) -> PlannedTube:
+    """The plan on the full plant with noise, and what noise does around any plan. Not collective."""
+    from softgrasp.lqr.observer.tube import make_tube, node_covariance, node_rows, run_tube
+
+    plant, judged = plan.horizon.plant, observed.judged
+    tube, rows = make_tube(plan, observed.controller), node_rows(tissue, plant.n_s)
+    every = max(1, tube.each // (plant.parts * STEPS))
+    run = run_tube(tube, observed.ticks, rows, len(plan.inputs) * tube.each, every)
+    gaps = [[separate(shape, plan.task.places + moved)[1] for shape in plan.task.shapes] for moved in run.moved]
+    return PlannedTube(tube, node_covariance(rows, judged), run.times, np.array(gaps).reshape(len(run.times), -1))
 
 
 def fixed_obstacles(model: Model) -> tuple[Obstacle, ...]:

@@ -45,6 +45,8 @@ class ObservedControl:
     """Standard deviation of the outputs, relative to the hand, by the full filter [m, rad], (o,)."""
     loop: ModalLoop
     """All modes of the plant."""
+    ticks: Ticks
+    """The full plant in them, from tick to tick."""
 
 
 def observe(design: Design, watch: Stopwatch) -> ObservedControl:
@@ -89,7 +91,7 @@ def observe(design: Design, watch: Stopwatch) -> ObservedControl:
                 f"{judged.abscissa:.3g}/s; raise control.observer.N, or lower control.Q for a slower loop"
             )
         without = on_root(problem.layout.comm, lambda: _without(ticks, controller, sensors))
-    return ObservedControl(controller, sensors, reduced, weight, judged, without, full, sd_full, loop)
+    return ObservedControl(controller, sensors, reduced, weight, judged, without, full, sd_full, loop, ticks)
 
 
 def _check(design: Design) -> None:

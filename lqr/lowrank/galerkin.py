@@ -11,6 +11,7 @@ import scipy.linalg
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, normalising, on_root, total
 from softgrasp.lqr.lowrank import modal_start
+from softgrasp.lqr.lowrank.definite import DefiniteTissue, well_damped
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.lowrank.shifts import frequency_estimate
@@ -19,6 +20,8 @@ from softgrasp.lqr.plant.block import Block
 
 NEW = 1e-9  # share of a response that must be new to the space; smaller parts are rounding of the solve
 ROUNDING = 1e-13  # of a Gram matrix: columns independent to 3e-7
+# n_e from which shifts may be real: on a few dozen unknowns responses at real shifts soon depend on each other
+DEFINITE_FROM = 5_000
 BUDGET = 0.45  # share of omega at which a response's damping ratio is held below critical
 
 
@@ -152,11 +155,13 @@ def frequencies(low: float, high: float, count: int) -> Array:
 class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
     """Galerkin on z = V eta, v_z = V eta' with V of modes and responses to the outputs.
 
-    V starts with the lowest modes and K_ee^{-1} C_z and grows by S(p)^{-1} C_z (one complex solve each) at
-    frequencies between the last mode and the highest one, until the gain changes by less than the tolerance between
-    two spaces, or the space is all of the tissue's. The small problem keeps the second-order form and the energy, so
-    it is stable whenever the tissue is damped. The true residual of such a solution is some 1e-3 although the gain is
-    right to 1e-8, its tissue's part to 1e-5; residual and changes of both parts are reported, not checked.
+    V starts with the lowest modes and K_ee^{-1} C_z and grows by S(p)^{-1} C_z at |p| between the last mode and the
+    highest one, until the gain changes by less than the tolerance between two spaces, or the space is all of the
+    tissue's. The shifts are real where damping keeps the poles of the modes left out away from the imaginary axis, so
+    that S(p) is definite; elsewhere each takes a complex solve. The small problem keeps the second-order form and the
+    energy, so it is stable whenever the tissue is damped. The true residual of such a solution is some 1e-3 in 2D
+    although the gain is right to 1e-8, its tissue's part to 1e-5; residual and changes of both parts are reported, not
+    checked.
     """
 
     method = "galerkin"
@@ -172,15 +177,20 @@ class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
         omega, Phi = modal_start.plant_modes(plant, min(self.modes, plant.layout.n_e))
         return Space(Phi, plant.mass(Phi), plant.stiff(Phi)), omega
 
+    def tissue_solver(self, plant: Plant, start: tuple[Space, Array]) -> ShiftedTissue:
+        """Definite solves at real shifts where they serve. Collective."""
+        real = plant.layout.n_e >= DEFINITE_FROM and well_damped(plant.system, _lowest(plant, start[1]))
+        if self.tissue == "definite" or (self.tissue == "auto" and real):
+            return DefiniteTissue(plant.system, _loads(plant).shape[1])
+        return super().tissue_solver(plant, start)
+
     def iterate(self, plant: Plant, tissue: ShiftedTissue, start: tuple[Space, Array]) -> Iterate:
         """Spaces one after the other until the gain settles. Collective."""
         space, omega = start
-        # where the modes do not decouple, the responses have to cover their range too
-        low = float(omega[-1] if plant.viscous is None else omega[0])
+        low = _lowest(plant, omega)
         high = max(frequency_estimate(plant.system), 2 * low)
         grid = frequencies(low, high, self.per_step * self.max_iterations).tolist()
-        # two-way the reaction of the hand loads the tissue as well
-        loads = np.hstack([plant.C_z, plant.G]) if plant.two_way else plant.C_z
+        loads, real = _loads(plant), isinstance(tissue, DefiniteTissue)
         level, space = solve_level(plant, space)
         history, change, used, whole = list[dict[str, float]](), np.inf, 0, plant.layout.n_e
         if len(level.omega) == whole:
@@ -191,7 +201,11 @@ class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
             if change <= self.tol or len(level.omega) == whole:
                 break
             # the static response first; shift number k + 1 belongs to frequency number k
-            take = [0j] if i == 0 else [_response_shift(plant, w) for w in grid[used - 1 :][: self.per_step]]
+            take = (
+                [0j]
+                if i == 0
+                else [complex(-w) if real else _response_shift(plant, w) for w in grid[used - 1 :][: self.per_step]]
+            )
             for j, p in enumerate(take):
                 response = tissue.solve(p, loads, take[j + 1 :])
                 parts = [response.real] if p.imag == 0 else [response.real, response.imag]
@@ -210,8 +224,19 @@ class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
             )
         settled = f"{order} basis vectors, gain settled to {history[-1]['change']:.1e}"
         about = f"all {order} basis vectors that there are" if order == whole else settled
+        about += f", {tissue.name} tissue solves"
         counts = {"solves": used, "basis": order, "spaces": len(history) + 1}
         return Iterate(level.Z, level.gain, about, history, counts)
+
+
+def _lowest(plant: Plant, omega: Array) -> float:
+    """Lowest frequency that the responses have to cover: where the modes do not decouple that of the first mode."""
+    return float(omega[-1] if plant.viscous is None else omega[0])
+
+
+def _loads(plant: Plant) -> Array:
+    """Loads of the outputs, and two-way that of the reaction of the hand, local rows (n_local, k)."""
+    return np.hstack([plant.C_z, plant.G]) if plant.two_way else plant.C_z
 
 
 def _response_shift(plant: Plant, omega: float) -> complex:

@@ -45,7 +45,7 @@ class LowRankSolver[Start](ABC):
     method: ClassVar[SolverName]  # name of the solver in scenes and results
     by_residual: ClassVar[bool] = True  # whether Z is compressed and accepted by its true residual
     tol: float = 1e-10  # bound on the true relative residual, 2-norm, hand-relative coordinates
-    tissue: str = "auto"  # gathered, distributed or auto, see softgrasp.lqr.lowrank.shifted
+    tissue: str = "auto"  # gathered, distributed or auto, see softgrasp.lqr.lowrank.shifted; for galerkin also definite
     progress: Progress | None = None  # called on every rank with every history entry
 
     def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
@@ -61,7 +61,7 @@ class LowRankSolver[Start](ABC):
         plant = Plant(problem)
         start = self.prepare(plant)
         seconds = {"start": time.perf_counter() - begin}
-        tissue = make_shifted(plant.system, self.tissue)
+        tissue = self.tissue_solver(plant, start)
         try:
             iterate = self.iterate(plant, tissue, start)
         finally:
@@ -93,6 +93,10 @@ class LowRankSolver[Start](ABC):
     @abstractmethod
     def prepare(self, plant: Plant) -> Start:
         """Preparation before the tissue solves. Collective."""
+
+    def tissue_solver(self, plant: Plant, start: Start) -> ShiftedTissue:
+        """What solves with S(p). Collective."""
+        return make_shifted(plant.system, self.tissue)
 
     @abstractmethod
     def iterate(self, plant: Plant, tissue: ShiftedTissue, start: Start) -> Iterate:

@@ -73,6 +73,7 @@ class Judged:
     cost: float  # J a second that the disturbances cause; infinite where the loop is not stable [1/s]
     cost_known: float  # least J a second, where the whole state is known [1/s]
     sd_outputs: Array  # standard deviation of the outputs from their target [m, rad], (o,)
+    sd_inputs: Array  # standard deviation of the inputs from those that were planned [N, N m], (n_s,)
     sd_error: Array  # standard deviation of the estimate of the outputs [m, rad], (o,)
     covariance: Array  # of the full state in modes, (n, n); empty where the loop is not stable
 
@@ -153,16 +154,16 @@ def judge(
         T, U = scipy.linalg.schur(inverse @ (map_.F - np.eye(len(map_.F))), output="real")
         abscissa = _abscissa(block_eigenvalues(T), plant.period)
         if not abscissa < 0:
-            none = np.full(len(plant.y), np.inf)
-            return Judged(abscissa, best, np.inf, least, none, none, np.zeros((0, 0)))
+            none, load = np.full(len(plant.y), np.inf), np.full(len(K), np.inf)
+            return Judged(abscissa, best, np.inf, least, none, load, none, np.zeros((0, 0)))
         X = _covariance(T, U, np.sqrt(2.0) * inverse @ map_.noise)
         seen = np.hstack([plant.y, np.zeros((len(plant.y), len(X) - n))])
         error, at_once = seen - controller.plant.C @ map_.estimate, controller.plant.C @ map_.direct
         y, e, u = seen @ X @ seen.T, error @ X @ error.T + at_once @ at_once.T, K @ map_.estimate
         inputs = u @ X @ u.T + (K @ map_.direct) @ (K @ map_.direct).T
         cost = float(np.sum(problem.Q * y) + np.sum(problem.R * inputs))
-        sd_y, sd_e = (np.sqrt(np.maximum(np.diag(part), 0.0)) for part in (y, e))
-        return Judged(abscissa, best, cost, least, sd_y, sd_e, X[:n, :n])
+        sd_y, sd_u, sd_e = (np.sqrt(np.maximum(np.diag(part), 0.0)) for part in (y, inputs, e))
+        return Judged(abscissa, best, cost, least, sd_y, sd_u, sd_e, X[:n, :n])
 
     return on_root(problem.layout.comm, evaluate)
 

@@ -27,6 +27,13 @@ def modes_couple(system: BlockSystem) -> bool:
     return system.damping.matrix is not None or (system.two_way and system.damping.alpha > 0)
 
 
+def least_beta(system: BlockSystem) -> float:
+    """Kelvin-Voigt time of the least damped layer [s]: D_ee >= alpha M_ee + beta K_ee."""
+    if system.damping.matrix is None:
+        return system.damping.beta
+    return min((m.beta for m in system.materials), default=0.0)
+
+
 def damp(system: BlockSystem, X: Array, M_X: Array | None = None, K_X: Array | None = None) -> Array:
     """D_ee X for local rows, with M_ee X and K_ee X where they are there already. Collective."""
     damping, result = system.damping, np.zeros_like(X)

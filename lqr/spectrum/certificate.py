@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +12,7 @@ from slepc4py import SLEPc
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc, from_options, total
 from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
+from softgrasp.fem.solve.stiffness import shared_factor
 from softgrasp.fem.system import dynamic_stiffness
 from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.lowrank.compress import gram
@@ -99,8 +102,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | N
     tail = None if why else TailBound(problem, K, modes)
     # the same bits on every rank: they decide how often all search
     aim, shift, guess = problem.layout.comm.bcast(_circle(problem, tail))
-    resolvent = Resolvent(problem, K, shift)
-    try:
+    with resolvent_of(problem, K, shift) as resolvent:
         for count in (guess, *(more for more in GROWTH if more > guess)):
             number = min(count, problem.layout.states - 2)
             values = resolvent.nearest(number)
@@ -109,9 +111,26 @@ def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | N
             enough = result.certified and (result.exact or result.radius >= ENOUGH * aim)
             if result.value >= 0 or short or enough or why:
                 break
-    finally:
-        resolvent.free()
     return result
+
+
+@contextmanager
+def resolvent_of(problem: RiccatiProblem, K: Block, shift: float) -> Iterator[Resolvent]:
+    """The resolvent with a factor that gains of one shift share. Collective."""
+    system, layout = problem.system, problem.layout
+    matrices = [A for A in (system.K_ee, system.M_ee, system.damping.matrix) if A is not None]
+    key = shift, system.damping.alpha, system.damping.beta, *((A.handle, A.stateGet()) for A in matrices)
+
+    def make() -> TissueSolver:
+        name = choose_solver(layout, few=True)[0]
+        return make_solver(dynamic_stiffness(system, shift), name, layout, PREFIX, rtol=1e-12)
+
+    with shared_factor(system, "resolvent", key, make) as solver:
+        resolvent = Resolvent(problem, K, shift, solver)
+        try:
+            yield resolvent
+        finally:
+            resolvent.shell.destroy()
 
 
 def _circle(problem: RiccatiProblem, tail: TailBound | None) -> tuple[float, float, int]:
@@ -161,22 +180,16 @@ def _conclude(values: np.ndarray, shift: float, tail: TailBound | None, why: str
 class Resolvent:
     """y = (sigma E - A - B K)^{-1} E x as a PETSc shell; local rows [hand on rank 0; z; v]."""
 
-    def __init__(self, problem: RiccatiProblem, K: Block, shift: float) -> None:
-        self.problem, self.K, self.shift = problem, K, shift
+    def __init__(self, problem: RiccatiProblem, K: Block, shift: float, solver: TissueSolver) -> None:
+        self.problem, self.K, self.shift, self.solver = problem, K, shift, solver
         self.system, self.layout, self.comm = problem.system, problem.layout, problem.layout.comm
         self.n_s, self.n = self.layout.n_s, self.layout.n_local
         self.drag = self.system.damping.drag
-        S, name = dynamic_stiffness(self.system, shift), choose_solver(self.layout, few=True)[0]
-        self.solver: TissueSolver = make_solver(S, name, self.layout, PREFIX, rtol=1e-12)
         self.extra = 2 * self.n_s if self.comm.rank == 0 else 0
         local = 2 * self.n + self.extra
         self.shell = PETSc.Mat().createPython(((local, self.layout.states),) * 2, self, comm=self.comm)
         self.shell.setUp()
-        try:
-            self._prepare()
-        except Exception:
-            self.free()
-            raise
+        self._prepare()
 
     def _prepare(self) -> None:
         """The hand's Schur complement, and the inputs' columns for the feedback. Collective."""
@@ -262,8 +275,3 @@ class Resolvent:
             eps.destroy()
             start.destroy()
         return np.asarray(self.comm.bcast(self.shift - 1 / theta))
-
-    def free(self) -> None:
-        """Free all PETSc objects. Collective."""
-        self.shell.destroy()
-        self.solver.destroy()

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from softgrasp.fem.petsc import Array, times_columns, total
-from softgrasp.fem.solve.statics import solve_columns
+from softgrasp.fem.solve.statics import mass_columns
 from softgrasp.fem.solve.stiffness import static_columns
 from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.lowrank.modal_start import plant_modes
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.operators import modes_couple
+from softgrasp.lqr.plant.operators import least_beta, modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 MODES = 60
@@ -22,19 +22,11 @@ def why_no_bound(problem: RiccatiProblem) -> str:
     system, damping = problem.system, problem.system.damping
     if not damping.active:
         return "no damping: modes beyond the radius stay on the axis"
-    if damping.matrix is not None and not least_beta(problem) > 0:
+    if damping.matrix is not None and not least_beta(system) > 0:
         return "a layer without damping of its own: only the eigenvalues inside the radius are known"
     if system.two_way and damping.drag > 0:
         return "two-way coupling with alpha > 0 in space: only the eigenvalues inside the radius are known"
     return ""
-
-
-def least_beta(problem: RiccatiProblem) -> float:
-    """Kelvin-Voigt time of the least damped layer [s]: D_ee >= alpha M_ee + beta K_ee."""
-    system = problem.system
-    if system.damping.matrix is None:
-        return system.damping.beta
-    return min((m.beta for m in system.materials), default=0.0)
 
 
 def tail_modes(problem: RiccatiProblem, k: int = MODES) -> tuple[Array, Array]:
@@ -76,7 +68,7 @@ class TailBound:
         inverse = np.linalg.inv(problem.M_s)
         hand_q, hand_v, gain_z, gain_v = K.parts
         self.K_q, self.K_v = (float(np.linalg.norm(k.T @ inverse, 2)) for k in (hand_q, hand_v))
-        self.alpha, self.beta = system.damping.alpha, least_beta(problem)
+        self.alpha, self.beta = system.damping.alpha, least_beta(system)
         self.coupled = modes_couple(system)
         self.drag = system.damping.drag
         force = system.G @ inverse
@@ -156,8 +148,8 @@ def _inverse_schur_mass(problem: RiccatiProblem, X: Array) -> Array:
     """M_ee^{-1} X, two-way (M_ee - G M_s^{-1} G')^{-1} X, local rows. Collective."""
     system, comm = problem.system, problem.layout.comm
     if not system.two_way:
-        return solve_columns(system.M_ee, problem.layout, X)
-    both = solve_columns(system.M_ee, problem.layout, np.hstack([X, system.G]))
+        return mass_columns(system, X)
+    both = mass_columns(system, np.hstack([X, system.G]))
     result, light = both[:, : X.shape[1]], both[:, X.shape[1] :]
     small = problem.M_s - total(comm, system.G.T @ light)
     return np.asarray(result + light @ np.linalg.solve(small, total(comm, system.G.T @ result)))

@@ -7,12 +7,15 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 
 CODE = Path(__file__).parent / "code"
 """Folder of the code that is the same for all models."""
+SHARED = ("vector.h", "golden.h", "timing.h")
 LINE = 4  # numbers in a line
 
 
@@ -23,6 +26,8 @@ def comment(text: str) -> str:
 
 def array(name: str, values: Array) -> str:
     """A constant array, its numbers in hexadecimal and independent of the locale."""
+    if not values.size:  # which C does not know
+        values = np.zeros([max(n, 1) for n in values.shape])
     sizes = "".join(f"[{n}]" for n in values.shape)
     return f"static const double {name}{sizes} = {_braces(values)};"
 
@@ -32,6 +37,18 @@ def _braces(values: Array) -> str:
         return "{\n" + ",\n".join(_braces(part) for part in values) + "}"
     words = [float(value).hex() for value in values]
     return "{" + ",\n ".join(", ".join(words[i : i + LINE]) for i in range(0, len(words), LINE)) + "}"
+
+
+def hexadecimal(values: Array) -> str:
+    """Numbers of a line of a log."""
+    return " ".join(float(value).hex() for value in values.ravel())
+
+
+def code_of(folder: Path, name: str) -> dict[str, str]:
+    """The texts of a program that are the same for all models: its own, those that all share, its Makefile."""
+    texts = {path.name: path.read_text() for path in [*folder.glob(f"*{name}.[ch]"), *CODE.glob("*.h")]}
+    shared = {key: text for key, text in texts.items() if name in key or key in SHARED}
+    return shared | {"Makefile": (CODE / "Makefile").read_text().replace("NAME", name)}
 
 
 def write_files(folder: Path, texts: Mapping[str, str]) -> list[Path]:

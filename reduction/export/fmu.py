@@ -55,7 +55,7 @@ def write_fmu(model: ReducedModel, path: str | Path, tick: float = 1e-3) -> Path
         ResourceError: the file cannot be written; what was there stays.
     """
     path, plant = Path(path), affine_plant(model, tick)
-    texts = {name: (CODE / name).read_text() for name in ("plant.c", "plant.h")} | plant_texts(plant)
+    texts = {name: (CODE / name).read_text() for name in ("plant.c", "plant.h", "vector.h")} | plant_texts(plant)
     texts |= {file.name: file.read_text() for file in FMI.iterdir() if file.suffix in (".c", ".h")}
     token = "{" + hashlib.sha256("\0".join(f"{k}\0{v}" for k, v in sorted(texts.items())).encode()).hexdigest() + "}"
     texts["token.h"] = f'#define TOKEN "{token}"\n'

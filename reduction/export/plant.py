@@ -10,7 +10,7 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.export.affine import AffinePlant, Label, affine_plant
-from softgrasp.reduction.export.c import CODE, array, comment, write_files
+from softgrasp.reduction.export.c import CODE, array, code_of, comment, hexadecimal, write_files
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import Stepper
 from softgrasp.reduction.system import UnstableModelError
@@ -45,9 +45,9 @@ def write_c(model: ReducedModel, folder: str | Path, tick: float = 1e-3) -> list
     ['Makefile', 'golden.log', 'plant.c']
     """
     plant = affine_plant(model, tick)
-    texts = {path.name: path.read_text() for path in CODE.glob("*plant.*")}
-    texts["Makefile"] = (CODE / "Makefile").read_text().replace("NAME", "plant")
-    return write_files(Path(folder), texts | plant_texts(plant) | {"golden.log": golden_log(model, plant)})
+    return write_files(
+        Path(folder), code_of(CODE, "plant") | plant_texts(plant) | {"golden.log": golden_log(model, plant)}
+    )
 
 
 def plant_texts(plant: AffinePlant) -> dict[str, str]:
@@ -93,16 +93,16 @@ def golden_log(model: ReducedModel, plant: AffinePlant) -> str:
     with suppress(UnstableModelError):
         stepper = Stepper(model.at(other), plant.tick, stepper.state)
         theta = np.array([[m.mu, m.lam, m.beta] for m in other])
-        parts.append((f"material {_hex(theta)}", _march(stepper, u[GOLDEN_STEPS:])))
+        parts.append((f"material {hexadecimal(theta)}", _march(stepper, u[GOLDEN_STEPS:])))
     most = np.abs(np.concatenate([y for _, y in parts])).max(axis=0)
     units = [label.unit for label in plant.outputs]
     scale = np.array([max(most[j] for j, other in enumerate(units) if other == unit) for unit in units])
     tolerance = TURNED if model.at().structured else DIGITS
-    lines = [f"tolerance {tolerance.hex()}", f"scale {_hex(np.where(scale > 0, scale, 1.0))}"]
+    lines = [f"tolerance {tolerance.hex()}", f"scale {hexadecimal(np.where(scale > 0, scale, 1.0))}"]
     for i, (head, y) in enumerate(parts):
         lines.append(head)
         rows = u[i * GOLDEN_STEPS :]
-        lines += [f"tick {_hex(row)} {_hex(values)}" for row, values in zip(rows, y, strict=False)]
+        lines += [f"tick {hexadecimal(row)} {hexadecimal(values)}" for row, values in zip(rows, y, strict=False)]
     return "\n".join([*lines, ""])
 
 
@@ -113,7 +113,3 @@ def _march(stepper: Stepper, u: Array) -> Array:
         y, x = stepper(row), stepper.state
         rows.append(np.concatenate([system.S_q @ x, system.S_v @ x, y]))
     return np.array(rows)
-
-
-def _hex(values: Array) -> str:
-    return " ".join(float(value).hex() for value in values.ravel())

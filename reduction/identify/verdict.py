@@ -113,10 +113,15 @@ def reasons(
 def warnings(residuals: Residuals, robust: bool) -> tuple[str, ...]:
     """What a reader should know although the answer stands, a sentence each."""
     found = []
+    if residuals.misfit < 2 - residuals.limit:
+        found.append(
+            f"The misfit is {residuals.misfit:.3g} sigma, below the {2 - residuals.limit:.3g} that chance leaves at "
+            "least: the noise is smaller than stated, so that its part is too large and may hide that of the mesh."
+        )
     if residuals.white < BY_CHANCE:
         found.append(
-            f"The residuals are not white (correlation of neighbours {residuals.lag:.2g}, probability by chance "
-            f"{residuals.white:.0e}): the noise is correlated, or the model lacks something smaller than the noise."
+            f"The residuals are not white (correlation of neighbours {residuals.lag:.2g}, probability by chance at "
+            f"most {max(residuals.white, 1e-15):.0e}): the noise is correlated, or the model lacks something below it."
         )
     if residuals.outliers > max(1, 1e-3 * residuals.count) and not robust:
         found.append(

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack, cast
 
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TaskProgressColumn
 
 from softgrasp.fem import Loop, Model, Stopwatch, remove_own, scene_hash
+from softgrasp.fem.solve.stiffness import sharing_factors
 from softgrasp.lqr import A_PRIORI, Design, PlantState, control_of, finite_problem, linearised, with_control
 from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import design
@@ -21,6 +22,9 @@ from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
 from softgrasp.study.pictures import Frames, draw_in_background
 from softgrasp.study.report import Page
 from softgrasp.study.shell import Flags, Session, folder_lock
+
+if TYPE_CHECKING:  # observers are not imported where a scene has none
+    from softgrasp.study.control.observer.result import ObservedStudy
 
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 
@@ -59,19 +63,20 @@ def run_control(
             exists = session.comm.bcast(restart.exists())
             word = "going on from" if exists else "interrupted, the same command goes on from"
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
-        feedback = design(linearised(model), watch, solver_bar(bar, model), restart)
-        observed = None
-        if control_of(model).observer is not None:  # first: what has no observer is refused at once
-            from softgrasp.study.control.observer.measure import observed_study  # no other scene needs it
+        plant = linearised(model)
+        observed, study = None, cast(GainStudy | None, None)
+        with sharing_factors(plant.system):
+            feedback = design(plant, watch, solver_bar(bar, model), restart)
+            if control_of(model).observer is not None:  # first: what has no observer is refused at once
+                from softgrasp.study.control.observer.measure import observed_study  # no other scene needs it
 
-            observed = observed_study(feedback, watch)
-        if gain_only:
-            study = small_study(feedback, watch, sentence)
-        else:
-            study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence)
+                observed = observed_study(feedback, watch)
+            if gain_only:
+                study = replace(small_study(feedback, watch, sentence), observed=observed)
+        if study is None:
+            study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence, observed)
             if retune:
                 study = with_retuning(model, study, watch, bar)
-    study = replace(study, observed=observed)
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
         saved = measure.save_controllers(study, out, end_state(model, study))
@@ -113,7 +118,13 @@ def end_state(model: Model, study: GainStudy) -> PlantState:
 
 
 def loop_study(
-    session: Session, model: Model, feedback: Design, watch: Stopwatch, bar: Progress, note: str
+    session: Session,
+    model: Model,
+    feedback: Design,
+    watch: Stopwatch,
+    bar: Progress,
+    note: str,
+    observed: ObservedStudy | None,
 ) -> tuple[ControlStudy, list[Path], Callable[[], list[Path]]]:
     """All reduced gains and the closed loops. Collective.
 
@@ -125,13 +136,14 @@ def loop_study(
     if control_of(model).constraints is not None:  # first: what has no plan is refused at once
         from softgrasp.study.control.obstacle.measure import planned_study  # no other scene needs it
 
-        planned = planned_study(feedback, watch, counted(bar, "plan on the full plant"))
+        found = None if observed is None else observed.observed
+        planned = planned_study(feedback, watch, counted(bar, "plan on the full plant"), found)
     bases: tuple[BasisGains, ...] = ()
     if feedback.modal:
         reason = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
     else:
         sizes, reason = orders(feedback)
-        with watch.stage("reduced"):
+        with watch.stage("reduced"), sharing_factors(feedback.problem.system):
             bases = measure.timed_gains(feedback, sizes, counted(bar, "reduced equations"))
         with watch.stage("bounds"):
             bases = bases_with_bounds(feedback, bases, duration, counted(bar, "duality gaps"))
@@ -145,7 +157,9 @@ def loop_study(
     if finite_strain:
         with watch.stage("finite strain"):
             finite = measure.run_finite(feedback, model, loops.full, duration, counted(bar, "loop of finite strain"))
-    study = ControlStudy(feedback, bases, small.controller, small.tick, notes, loops, finite, planned=planned)
+    study = ControlStudy(
+        feedback, bases, small.controller, small.tick, notes, loops, finite, planned=planned, observed=observed
+    )
     return study, frames.close(), _drawn(session, study, frames)
 
 

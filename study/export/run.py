@@ -1,4 +1,4 @@
-"""``softgrasp export``: a saved reduced model as C and as FMU."""
+"""``softgrasp export``: a saved reduced model as C and as FMU, a controller as C."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DOORS = "--c FOLDER or --fmu FILE"
 def run_export(
     path: Path, console: Console, *, c: Path | None = None, fmu: Path | None = None, tick: float = 1e-3
 ) -> None:
-    """Write a saved model for other programs, see ``softgrasp export --help``. Collective; rank 0 writes.
+    """Write a saved model or controller for other programs, see ``softgrasp export --help``. Collective; rank 0 writes.
 
     Raises:
         SoftgraspError: with one sentence; nothing is half-written.
@@ -33,20 +33,38 @@ def run_export(
 def _export(path: Path, console: Console, c: Path | None, fmu: Path | None, tick: float) -> None:
     if c is None and fmu is None:
         raise SceneError(f"softgrasp export {path}: name what to write: {DOORS}")
+    if fmu is not None and fmu.suffix != ".fmu":
+        raise SceneError(f"--fmu {fmu}: simulators know an FMU by its ending; name it {fmu.with_suffix('.fmu').name}")
+    files = _controller(path, console, c, fmu) if path.suffix == ".npz" else _model(path, console, c, fmu, tick)
+    list_files(console, files)
+    if c is not None:
+        console.print(f"next: make -C {shlex.quote(str(c))} test time", soft_wrap=True, markup=False)
+
+
+def _controller(path: Path, console: Console, c: Path | None, fmu: Path | None) -> list[Path]:
+    from softgrasp.lqr.export.controller import write_controller  # with lqr, which models do not need
+    from softgrasp.lqr.loop.controller import Controller
+
+    if fmu is not None or c is None:
+        raise SceneError(f"--fmu {fmu}: {path} is a controller, which is exported with --c FOLDER")
+    controller = Controller.load(path)
+    seen = "no observer" if controller.observer is None else f"an observer of {len(controller.observer.C)} samples"
+    text = f"{path.name}: N = {controller.plant.N}, {seen}, a tick of {controller.period:g} s"
+    console.print(text, soft_wrap=True, markup=False)
+    return write_controller(controller, c)
+
+
+def _model(path: Path, console: Console, c: Path | None, fmu: Path | None, tick: float) -> list[Path]:
     model = load(path)
     if not isinstance(model, ReducedModel):
         raise SceneError(f"{path}: only linear reduced models are exported; this one is of finite strain")
-    if fmu is not None and fmu.suffix != ".fmu":
-        raise SceneError(f"--fmu {fmu}: simulators know an FMU by its ending; name it {fmu.with_suffix('.fmu').name}")
     files = [] if c is None else write_c(model, c, tick)
     files += [] if fmu is None else [write_fmu(model, fmu, tick)]
     console.print(f"{path.name}: {model.name}, N = {model.N}, a tick of {tick:g} s", soft_wrap=True, markup=False)
-    list_files(console, files)
     if model.structure == "none":
         console.print(
             "warning: this basis keeps no structure, so that the model may be unstable with other materials, which the "
             "C does not test; craig_bampton and the psd bases are stable with all",
             style="yellow", soft_wrap=True, markup=False,
         )  # fmt: skip
-    if c is not None:
-        console.print(f"next: make -C {shlex.quote(str(c))} test time", soft_wrap=True, markup=False)
+    return files

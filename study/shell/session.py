@@ -53,13 +53,15 @@ class Session:
         """Ranks that run the command."""
         return MPI.COMM_WORLD
 
-    def scene(self) -> Scene:
+    def scene(self, beside: Sequence[Path] = ()) -> Scene:
         """Load the scene file, claim the folder, and print name and description. Collective.
+
+        ``beside``: further files that the command reads.
 
         Raises SceneError: the file or a key is wrong, or the folder holds another run.
         """
         scene = load_scene_collective(self.comm, self.path, self.overrides)
-        self.claim(scene.name, lambda: [find_scene(self.path), *scene.files])
+        self.claim(scene.name, lambda: [find_scene(self.path), *scene.files, *beside])
         described = f": {escape(scene.description)}" if scene.description else ""
         self.console.print(f"[bold]{escape(scene.name)}[/bold]{described}", soft_wrap=True)
         return scene

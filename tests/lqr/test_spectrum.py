@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene
+from softgrasp.fem.solve.stiffness import sharing_factors
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.design.scene import with_control
 from softgrasp.lqr.lowrank.modal_start import modal_start
@@ -19,6 +20,7 @@ from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.riccati import solve
+from softgrasp.lqr.spectrum import certificate
 from softgrasp.lqr.spectrum.certificate import abscissa
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
 from softgrasp.lqr.spectrum.tail import TailBound
@@ -140,3 +142,23 @@ def test_reasons_where_there_is_no_bound() -> None:
         assert not found.certified
         assert words in found.reason
         assert abs(found.value - poles(problem, K).real.max()) < 1e-8  # tolerance 1e-9 of poles of size 10
+
+
+@pytest.mark.ranks
+def test_gains_of_one_circle_share_a_factor(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, made = small(KELVIN), list[str]()
+    make = certificate.make_solver
+
+    def counted(*args: Any, **more: Any) -> Any:
+        made.append(args[1])
+        return make(*args, **more)
+
+    monkeypatch.setattr(certificate, "make_solver", counted)
+    gains = [Gain.of_block(gain(problem).times(np.eye(2) * scale)) for scale in (1.0, 0.9)]
+    with sharing_factors(problem.system):
+        shared = [abscissa(problem, K) for K in gains]
+    assert shared[0].shift == shared[1].shift
+    assert len(made) == 1
+    alone = [abscissa(problem, K) for K in gains]
+    assert len(made) == 3
+    assert [a.value for a in alone] == [a.value for a in shared]

@@ -1,24 +1,8 @@
 #include "plant.h"
 #include "plant_data.h"
-
-#ifdef __FAST_MATH__
-#error "compile without -ffast-math: it removes the tests for numbers that are not finite"
-#endif
+#include "vector.h"
 
 enum { N = SG_PLANT_N };
-
-static double size(double x) { return x < 0 ? -x : x; }
-
-/* 0 for finite numbers, else not a number */
-static double defect(const double *x, int n) {
-    double sum = 0;
-    for (int i = 0; i < n; ++i) sum += 0 * x[i];
-    return sum;
-}
-
-static void add(double factor, const double *restrict x, double *restrict y, int n) {
-    for (int i = 0; i < n; ++i) y[i] += factor * x[i];
-}
 
 /* Triangles of a matrix held column by column, by Gauss with row pivots. */
 static int factor(double a[N][N], int pivot[N]) {

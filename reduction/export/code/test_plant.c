@@ -1,18 +1,11 @@
 /* Replays golden.log, which softgrasp wrote with its own steps, and tries what must be refused: test_plant golden.log */
-#include <stdio.h>
 #include <string.h>
 
+#include "golden.h"
 #include "plant.h"
+#include "vector.h"
 
 static sg_plant plant;
-
-static int numbers(FILE *log, double *x, int n) {
-    for (int i = 0; i < n; ++i)
-        if (fscanf(log, "%la", x + i) != 1) return 0;
-    return 1;
-}
-
-static double size(double x) { return x < 0 ? -x : x; }
 
 /* Largest difference of an output over the largest value of its unit; -1 if the log is not whole. */
 static double replay(FILE *log, long *ticks, double *tolerance) {

@@ -2,30 +2,44 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem import Stopwatch, on_root
-from softgrasp.lqr import Design, Notify, Plan, plan_control, quadratic_program
+from softgrasp.lqr import Design, Notify, Plan, control_of, plan_control, quadratic_program
 from softgrasp.lqr.constrained.least_distance import nearest
 from softgrasp.study.control.obstacle.result import PlannedStudy
 from softgrasp.study.shell import repeated
 
-SOLUTIONS = 10  # of the quadratic program, behind its times
+if TYPE_CHECKING:
+    from softgrasp.lqr.design.observer import ObservedControl
+
+SOLUTIONS = 10  # of the quadratic program without a guess, behind its times
+NEIGHBOURS = 100  # programs near to it that are solved from its rows
+MOVED = 1e-3  # by which their gaps and limits differ from it, at most [m, N, m/s]
 
 
-def planned_study(design: Design, watch: Stopwatch, notify: Notify) -> PlannedStudy:
+def planned_study(
+    design: Design, watch: Stopwatch, notify: Notify, observed: ObservedControl | None = None
+) -> PlannedStudy:
     """Plan, runs and times. Collective. Raises ControlError, SolverError: see :func:`plan_control`."""
-    planned = plan_control(design, watch, notify)
+    planned = plan_control(design, watch, notify, observed)
     rows, cold, warm = on_root(design.problem.layout.comm, lambda: times(planned.plan))
-    return PlannedStudy(planned, design.gain_check.optimal, rows, cold, warm)
+    return PlannedStudy(planned, design.gain_check.optimal, rows, cold, warm, 1 / control_of(design.model).loop.rate)
 
 
 def times(plan: Plan) -> tuple[int, tuple[float, ...], tuple[float, ...]]:
-    """Rows of the last quadratic program, and its seconds cold and from its own active rows; none where it is soft."""
+    """Rows of the last quadratic program, and seconds cold and of programs nearby from its active rows.
+
+    No seconds where it is soft.
+    """
     G, h = quadratic_program(plan)
     if plan.depth > 0:
         return len(h), (float("nan"),), (float("nan"),)
     cold = repeated(MPI.COMM_SELF, lambda: nearest(G, h), SOLUTIONS)
-    warm = repeated(MPI.COMM_SELF, lambda: nearest(G, h, plan.active), SOLUTIONS)
+    generator = np.random.default_rng(0)
+    near = (h + MOVED * generator.random(len(h)) for _ in range(NEIGHBOURS))  # more room: every one has a solution
+    warm = repeated(MPI.COMM_SELF, lambda: nearest(G, next(near), plan.active), NEIGHBOURS)
     return len(h), tuple(np.asarray(cold).tolist()), tuple(np.asarray(warm).tolist())

@@ -9,10 +9,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
 from scipy.spatial import cKDTree
 
 from softgrasp.fem import AXES, PictureMesh
+from softgrasp.fem.obstacles.shapes import Shape
+from softgrasp.fem.petsc import Array
 from softgrasp.lqr import PlannedControl
+from softgrasp.lqr.constrained.separation import separate
+from softgrasp.lqr.design.constrained import PlannedTube
 from softgrasp.study.control.obstacle.result import PlannedStudy
 from softgrasp.study.pictures import draw_obstacle, style
 
@@ -25,6 +30,8 @@ LIMIT: dict[str, Any] = {"color": "#999999", "lw": 0.8, "ls": (0, (4, 2))}
 def draw_plan(study: PlannedStudy, picture: PictureMesh | None, out: Path) -> list[Path]:
     """All figures of a plan. Rank 0 only."""
     files = list(figure_gaps(study.planned, out / "gaps.png"))
+    if np.isfinite(study.seconds_cold).all():
+        files += figure_times(study, out / "times.png")
     if picture is not None:
         files += figure_bodies(study.planned, picture, out / "obstacle.png")
     return files
@@ -70,6 +77,33 @@ def figure_bodies(planned: PlannedControl, picture: PictureMesh, out_png: Path) 
         return style.save(figure, out_png)
 
 
+def figure_times(study: PlannedStudy, out_png: Path) -> tuple[Path, ...]:
+    """Histogram of the times of the quadratic program against tick and interval; PNG and PDF."""
+    kinds = {"without a guess": study.seconds_cold, "from a plan nearby": study.seconds_warm}
+    grid = study.planned.plan.horizon.plant.grid
+    every = np.concatenate([*kinds.values(), [study.tick, grid]])
+    edges = np.geomspace(every.min() / 2, 2 * every.max(), 60).tolist()
+    with style.paper_style():
+        figure, ax = plt.subplots(figsize=(style.WIDTH, 0.35 * style.WIDTH), layout="constrained")
+        for colour, (name, seconds) in zip(style.CYCLE, kinds.items(), strict=False):
+            ax.hist(seconds, edges, color=colour, alpha=0.8, label=f"{name}, {len(seconds)} times")
+        top = ax.get_ylim()[1]
+        for at, name in ((study.tick, "tick"), (grid, "interval")):
+            ax.axvline(at, **LIMIT)
+            ax.annotate(name, (at, top), xytext=(3, -2), textcoords="offset points", va="top", color="#666666")
+        ax.set(xscale="log", xlabel="time of the quadratic program [s]", ylabel="number")
+        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+        return style.save(figure, out_png)
+
+
+def _deviation(tube: PlannedTube, shape: Shape, body: Array) -> Array:
+    """Standard deviation of the gap, that of the nearest node along its normal [m], (times,)."""
+    normals = np.array([separate(shape, at)[0] for at in body])
+    nearest = np.einsum("td,tjd->tj", normals, body).argmin(axis=1)
+    return np.asarray(np.sqrt(np.einsum("td,tde,te->t", normals, tube.covariance[nearest], normals)))
+
+
 def figure_gaps(planned: PlannedControl, out_png: Path) -> tuple[Path, ...]:
     """Gaps, forces and speed over time with margin and limits; PNG and PDF."""
     run, task = planned.runs.planned, planned.plan.task
@@ -78,14 +112,18 @@ def figure_gaps(planned: PlannedControl, out_png: Path) -> tuple[Path, ...]:
         figure, (gaps, force, speed) = plt.subplots(
             3, 1, figsize=(style.WIDTH, 0.75 * style.WIDTH), sharex=True, layout="constrained"
         )
-        margin = task.clearance + float(task.error.max(initial=0.0))
+        margin = task.clearance + float(np.max(task.error + task.noise, initial=0.0))
         for i, name in enumerate(planned.names):
             gaps.plot(run.times[thin], run.gaps[thin, i], color=style.CYCLE[i % 4], label=name)
+            if planned.tube is not None:
+                room = 3 * _deviation(planned.tube, task.shapes[i], run.body[thin])
+                low, high = run.gaps[thin, i] - room, run.gaps[thin, i] + room
+                gaps.fill_between(run.times[thin], low, high, color=style.CYCLE[i % 4], alpha=0.25, lw=0)
         if run.gaps.min(initial=1.0) > 0:
             gaps.set_yscale("log")
         else:  # within a millimetre the axis is linear
             gaps.set_yscale("symlog", linthresh=1e-3)
-        gaps.axhline(margin, **LIMIT, label="clearance and margin")
+        gaps.axhline(margin, **LIMIT, label="clearance and margins")
         gaps.set_ylabel("gap [m]")
         gaps.legend(ncols=4, loc="upper right")
         for j, axis in enumerate(AXES[: run.inputs.shape[1]]):

@@ -16,8 +16,11 @@ from softgrasp.study.report import Section, Table, captioned, listed
 CAPTIONS = {
     "obstacle.png": "The boundary of the body on the full plant under the plan, and the way of its middle; grey and "
     "dashed: under the optimal feedback, which knows no obstacle, where it is deepest inside.",
-    "gaps.png": "Gap of the body to every obstacle on the full plant. Dashed: clearance and margin, which the reduced "
-    "plant keeps; the full plant may use the margin up. Below: force and speed of the hand with their limits.",
+    "gaps.png": "Gap of the body to every obstacle on the full plant, with a band of three standard deviations where "
+    "an observer keeps it on its way under noise. Dashed: clearance and margins, which the reduced plant keeps; the "
+    "full plant may use the margins up. Below: force and speed of the hand with their limits.",
+    "times.png": "Times of the quadratic program in Python, without a guess and from the rows that hold a plan nearby, "
+    "against a tick of the loop and the interval after which the next plan is due.",
 }
 GAPS = ("obstacle", "least gap [m]", "at [s]", "without the plan [m]")
 
@@ -81,6 +84,7 @@ def facts(study: PlannedStudy) -> list[tuple[str, str]]:
             ),
             ("margin between two instants", f"{plan.bend:.2g} m where a gap holds the plan"),
             ("clearance", f"{task.clearance:.3g} m"),
+            *_noisy(study),
             ("error of the run's own step", f"{runs.step_error:.2g} m, measured against the exact modes"),
             ("cost of a metre of one gap at one instant", f"{plan.multiplier:.3g} at most"),
         ]
@@ -97,8 +101,25 @@ def facts(study: PlannedStudy) -> list[tuple[str, str]]:
         rows.append(("ways tried", "; ".join(ways) + more))
     if plan.active:
         cold, warm = (1e3 * float(np.median(x)) for x in (study.seconds_cold, study.seconds_warm))
-        rows.append(("time of the quadratic program", f"{cold:.2g} ms, from a plan nearby {warm:.2g} ms, in Python"))
+        rows.append(
+            (
+                "time of the quadratic program",
+                f"{cold:.2g} ms, from a plan nearby {warm:.2g} ms, in Python; a plan is due every {plant.grid:g} s",
+            )
+        )
     return rows
+
+
+def _noisy(study: PlannedStudy) -> list[tuple[str, str]]:
+    """Margin for noise, and the least gap of a run with it."""
+    tube, task = study.planned.tube, study.planned.plan.task
+    if tube is None:
+        return []
+    sd = np.sqrt(np.einsum("jdd->jd", tube.covariance)).max()
+    return [
+        ("margin for noise", f"{np.max(task.noise):.3g} m, a node deviates by {sd:.2g} m: an estimate, no bound"),
+        ("least gap of a run with noise", f"{tube.gaps.min():.3g} m, the observer's feedback around the plan"),
+    ]
 
 
 def _held(plan: Plan) -> str:

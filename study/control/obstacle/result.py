@@ -18,7 +18,8 @@ class PlannedStudy:
     optimal_cost: float  # least cost J* of all inputs without obstacles and limits
     rows: int  # of the quadratic program
     seconds_cold: tuple[float, ...]  # time of the quadratic program without a guess [s]
-    seconds_warm: tuple[float, ...]  # time of it from the rows that hold its solution [s]
+    seconds_warm: tuple[float, ...]  # time of programs nearby from the rows that hold its solution [s]
+    tick: float  # time between two ticks of the loop [s]
 
     @property
     def excess(self) -> float:
@@ -38,7 +39,7 @@ class PlannedStudy:
     def result(self) -> dict[str, Any]:
         """The key "obstacle" of ``result.json``."""
         plan, runs = self.planned.plan, self.planned.runs
-        task, plant = plan.task, plan.horizon.plant
+        task, plant, tube = plan.task, plan.horizon.plant, self.planned.tube
         used = np.abs(runs.planned.inputs).max(axis=0)
         return {
             "names": list(self.planned.names),
@@ -49,7 +50,9 @@ class PlannedStudy:
                 "clearance": task.clearance,
                 "reduced_plant": float(task.error.max(initial=0.0)),
                 "between_instants": plan.bend,
+                **({} if tube is None else {"noise": float(np.max(task.noise))}),
             },
+            **({} if tube is None else {"gap_min_noisy": tube.gaps.min(axis=0).tolist()}),
             "error_of_reduced_plant": runs.reduction_error,
             "error_of_run_step": runs.step_error,
             "certified": plan.certified,
@@ -77,6 +80,7 @@ class PlannedStudy:
             "ways_untried": plan.untried,
             "inputs": plan.inputs.tolist(),
             "dt": runs.dt,
+            "tick": self.tick,
             "time_cold": [float(np.median(self.seconds_cold)), max(self.seconds_cold)],
             "time_warm": [float(np.median(self.seconds_warm)), max(self.seconds_warm)],
         }

@@ -14,8 +14,8 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import times_columns, total
 from softgrasp.fem.solve import stiffness
 from softgrasp.fem.solve.modes import lowest_modes
-from softgrasp.fem.solve.statics import equilibrium
-from softgrasp.fem.solve.stiffness import static_columns
+from softgrasp.fem.solve.statics import equilibrium, mass_columns
+from softgrasp.fem.solve.stiffness import sharing_factors, static_columns
 from tests.helpers.models import CUBE, make_scene
 
 WEIGHT: dict[str, Any] = {"effects": {"gravity": {"g": [0.0, -9.81]}}}
@@ -78,3 +78,35 @@ def test_a_large_factor_is_freed(comm: MPI.Intracomm, made: list[str], monkeypat
     assert (first == second).all()
     assert len(made) == 2
     assert "factor" not in system.kept
+
+
+@pytest.mark.ranks
+def test_a_large_factor_is_shared_to_the_end_of_a_block(
+    comm: MPI.Intracomm, made: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stiffness, "KEPT_LIMIT", dict.fromkeys((1, 2, 3), 10))
+    system = build(make_scene(CUBE), comm=comm).system
+    with sharing_factors(system):
+        first = static_columns(system, system.G)
+        with sharing_factors(system):
+            second = static_columns(system, system.G)
+        third = static_columns(system, system.G)
+        assert len(made) == 1
+        system.K_ee.scale(2.0)
+        fourth = static_columns(system, system.G)
+        assert len(made) == 2
+    assert (first == second).all()
+    assert (first == third).all()
+    assert fourth == pytest.approx(first / 2, rel=1e-9, abs=1e-14)  # two factors of rounding
+    assert not {"factor", stiffness.SHARED} & set(system.kept)
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("changes", [{}, {"tissue": {"order": 2}}])
+def test_momenta_are_solved_without_a_factor(comm: MPI.Intracomm, made: list[str], changes: dict[str, Any]) -> None:
+    system = build(make_scene(CUBE, changes), comm=comm).system
+    X = mass_columns(system, system.G)
+    error = times_columns(system.M_ee, X) - system.G
+    size, wrong = total(comm, np.array([np.sum(system.G**2), np.sum(error**2)]))
+    assert wrong < 1e-22 * size  # the square of ten times its tolerance
+    assert not made

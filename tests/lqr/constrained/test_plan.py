@@ -85,6 +85,7 @@ def test_wall_is_kept_on_the_full_plant(N: int, margin: float) -> None:
     assert runs.step_error < 1e-4  # phase of the midpoint steps of 5 ms
 
 
+@pytest.mark.serial  # on ranks the plan of a small plant, below
 def test_without_margin_the_full_plant_hits_the_wall(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planning, "ROOM", 0.0)
     plant, given = task(30, WALL)
@@ -94,6 +95,7 @@ def test_without_margin_the_full_plant_hits_the_wall(monkeypatch: pytest.MonkeyP
     assert run(plan).planned.least[0] < -2e-5
 
 
+@pytest.mark.serial  # on ranks the plan of a small plant, below
 def test_disc_is_passed_on_the_cheaper_side() -> None:
     plant, given = task(14, DISC)
     plan = make_plan(plant, given, 30)

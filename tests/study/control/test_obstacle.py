@@ -53,7 +53,9 @@ def test_page_files_and_numbers_agree(tmp_path: Path) -> None:
     assert len(rows) == found["intervals"]
     assert np.allclose([[float(row["u_x [N]"]), float(row["u_y [N]"])] for row in rows], found["inputs"], atol=1e-12)
     assert min(float(row["least gap to wall [m]"]) for row in rows) == found["gap_min"][1]
-    for name in ("obstacle.png", "gaps.png"):
+    assert 0 < found["time_warm"][0] < found["time_warm"][1]
+    assert found["tick"] == 1e-3
+    for name in ("obstacle.png", "gaps.png", "times.png"):
         assert (tmp_path / name).stat().st_size > 10_000
     page = (tmp_path / "report.html").read_text()
     assert "knows no obstacle" in page

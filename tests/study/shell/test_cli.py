@@ -227,7 +227,7 @@ def test_without_a_compiler_there_is_one_sentence(tmp_path: Path, ranks: int, mo
 def test_help_teaches() -> None:
     shown = softgrasp("--help")
     assert shown.returncode == 0
-    for words in ("Run a scene", "Reduce, control and study", "Examples", "Exit status", "3: an answer of query"):
+    for words in ("Run a scene", "Reduce, control and study", "Examples", "Exit status", "3: an answer is refused"):
         assert words in shown.stdout
     assert shown.stdout.index("Examples") < shown.stdout.index("softgrasp sweep my.toml") < shown.stdout.index("Exit")
 

@@ -1,0 +1,1 @@
+"""``softgrasp identify``: the material from measured outputs."""

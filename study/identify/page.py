@@ -1,0 +1,154 @@
+"""The page of ``softgrasp identify``: values with their errors, what the data see, and what speaks against them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.columns import labels
+from softgrasp.reduction.identify.result import Identified
+from softgrasp.reduction.identify.verdict import BY_CHANCE, direction_in_words, percent
+from softgrasp.study.report import Section, Table, captioned, listed
+from softgrasp.study.shell import Session
+from softgrasp.study.shell.session import Page
+
+CAPTIONS = {
+    "fit.png": "Above: measured outputs (dots) and the fit (lines), of each experiment. Below: residuals over the "
+    "stated standard deviation of the noise; the grey band holds 95 % of white noise.",
+    "ellipses.png": "Pairs of values: change against the answer. Ellipses: 68 and 95 % of the noise. Lines to a dot: "
+    "the answer without the error of the mesh, of the time step, of the reduction; no dot: it lies outside.",
+    "history.png": "Values after each round over the final ones; a round is a fit with one reduced model.",
+}
+
+
+def compose(answer: Identified, session: Session, fitted: Path, options: str) -> Page:
+    """Draw the pictures and compose the page."""
+    drawn: list[Path] = []
+    if session.pictures:
+        from softgrasp.study.identify.plots import draw  # brings Matplotlib
+
+        drawn += draw(answer, session.out)
+    figures = captioned(drawn, CAPTIONS)
+    sections = [
+        Section("", figures=figures[:1]),
+        value_table(answer).section(
+            "Noise: standard deviation. Mesh and time step: estimates; reduction: measured by a full run. Signed parts "
+            "are those of value / truth - 1.",
+            terminal=True, figures=figures[1:2],
+        ),
+        sight_table(answer).section("A deviation above 100 % is no knowledge."),
+        *([nuisance_table(answer).section(terminal=True)] if answer.nuisances else []),
+        Section("Fit", rows=fit_rows(answer), figures=figures[2:], terminal=True),
+    ]  # fmt: skip
+    return Page(
+        f"{answer.scene.name}: material from measurements", summary(answer), sections,
+        {"values.csv": value_table(answer), "residuals.csv": residual_table(answer)}, [*drawn, fitted], options,
+        errors=[error_sentence(answer)], warnings=[*answer.reasons, *answer.warnings],
+    )  # fmt: skip
+
+
+def value_table(answer: Identified) -> Table:
+    """Each value with the parts of its error."""
+    header = ("parameter", "start", "value", "unit", "noise", *answer.parts, "together")
+    rows = [
+        (
+            u.name, float(answer.start[i]), float(answer.values[i]), u.unit, percent(answer.noise[i]),
+            *("not known" if part is None else percent(part[i], "+") for part in answer.parts.values()),
+            percent(answer.total[i]),
+        )
+        for i, u in enumerate(answer.unknowns)
+    ]  # fmt: skip
+    return Table(header, rows, "Values and the parts of their errors")
+
+
+def sight_table(answer: Identified) -> Table:
+    """What the data see, the best first."""
+    rows = [
+        (direction_in_words(answer.unknowns, d), percent(1 / max(float(s), 1e-12)))
+        for s, d in zip(answer.sight, answer.directions, strict=True)
+    ]
+    return Table(("the data see", "with a deviation of"), rows, "What the data see")
+
+
+def nuisance_table(answer: Identified) -> Table:
+    """Offsets and time shifts."""
+    return Table(("fitted beside the material", "value", "standard deviation"), answer.nuisances, "Markers and clocks")
+
+
+def residual_table(answer: Identified) -> Table:
+    """Measured and fitted outputs, empty where nothing was measured."""
+    names = [f"{c.label} [{c.unit}]" for c in answer.columns]
+    header = ("experiment", "time [s]", *names, *(f"fitted {name}" for name in names))
+    rows = [
+        (data.name, float(t), *(None if np.isnan(x) else float(x) for x in (*measured, *fitted)))
+        for data, table in zip(answer.data, answer.fitted, strict=True)
+        for t, measured, fitted in zip(data.times, data.values, table, strict=True)
+    ]
+    return Table(header, rows, "Residuals")
+
+
+def fit_rows(answer: Identified) -> list[tuple[str, str]]:
+    """How good the fit is, and what it cost."""
+    r, k = answer.residuals, len(answer.unknowns)
+    pairs = [
+        f"{answer.unknowns[i].name} and {answer.unknowns[j].name} {answer.correlation[i, j]:+.2f}"
+        for i in range(k)
+        for j in range(i)
+    ]
+    return [
+        ("numbers", f"{r.count} of {listed(labels(answer.columns))}, in {len(answer.data)} experiment(s)"),
+        ("misfit", f"{r.misfit:.3g} sigma, by chance at most {r.limit:.3g}"),
+        ("white", f"correlation of neighbours {r.lag:+.2g}, probability by chance {max(r.white, 1e-15):.2g}"),
+        ("outliers", f"{r.outliers} above 4 sigma"),
+        *([("correlation", ", ".join(pairs))] if pairs else []),
+        ("work", f"{len(answer.history) - 1} rounds, {answer.runs} reduced runs, N = {answer.N}"),
+    ]
+
+
+def error_sentence(answer: Identified) -> str:
+    """Values with all their errors together."""
+    if answer.reasons:
+        return "The answer is refused; do not use its values."
+    values = [
+        f"{u.name} = {v:.4g} {u.unit} with an error of about {percent(e)}"
+        for u, v, e in zip(answer.unknowns, answer.values, answer.total, strict=True)
+    ]
+    return f"The data give {listed(values)}."
+
+
+def summary(answer: Identified) -> list[str]:
+    """What came out, in two sentences."""
+    r = answer.residuals
+    size = "no larger than the noise" if r.misfit <= r.limit else "larger than the noise"
+    white = "white" if r.white >= BY_CHANCE else "not white"
+    next_step = ["fitted.toml is the scene with these values; simulate, reduce and control take it."]
+    return [f"The residuals are {size}, {r.misfit:.3g} sigma, and {white}.", *(next_step if not answer.reasons else [])]
+
+
+def result_of(answer: Identified) -> dict[str, Any]:
+    """The keys of ``result.json``."""
+    return {
+        "refused": list(answer.reasons),
+        "warnings": list(answer.warnings),
+        "values": {
+            u.name: {
+                "value": answer.values[i], "unit": u.unit, "start": answer.start[i], "noise": answer.noise[i],
+                **{name: None if part is None else part[i] for name, part in answer.parts.items()},
+                "together": answer.total[i],
+            }
+            for i, u in enumerate(answer.unknowns)
+        },
+        "correlation": answer.correlation,
+        "directions": [
+            {"deviation": 1 / max(float(s), 1e-300), "of": dict(zip([u.name for u in answer.unknowns], d, strict=True))}
+            for s, d in zip(answer.sight, answer.directions, strict=True)
+        ],
+        "beside": [{"name": n, "value": v, "deviation": s} for n, v, s in answer.nuisances],
+        "residuals": answer.residuals,
+        "history": answer.history,
+        "N": answer.N,
+        "runs": answer.runs,
+        "mesh": None if answer.estimate is None else {"estimate": answer.estimate.estimate, "n_e": answer.estimate.n_e},
+    }  # fmt: skip

@@ -1,0 +1,102 @@
+"""The C of a controller against ``Controller.step``: with and without an observer, limits, late and lost samples."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import Stopwatch, build
+from softgrasp.fem.scene.file import load_scene
+from softgrasp.lqr.design.controller import make_controller
+from softgrasp.lqr.design.feedback import design
+from softgrasp.lqr.design.observer import observe
+from softgrasp.lqr.export.controller import write_controller
+from softgrasp.lqr.loop.controller import Controller
+
+pytestmark = [
+    pytest.mark.serial,
+    pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler cc here"),
+]
+SAMPLES = "markers=[[0,0],[1,0],[0,1],[1,1]],noise={speed=0.01},delay=2"
+OBSERVER = f"control.observer={{{SAMPLES},disturbance={{box=[[0,0],[1,0]]}}}}"
+
+
+@cache
+def controller(kind: str) -> Controller:
+    observed = kind == "late"
+    model = build(load_scene("paper_lqr", ["tissue.cells=[2,4]", *[OBSERVER] * observed]), comm=MPI.COMM_SELF)
+    made = design(model)
+    if observed:
+        return observe(made, Stopwatch(MPI.COMM_SELF)).controller
+    plain = make_controller(made, order=10)
+    if kind == "limited":  # one axis, far below what the gain asks for
+        return replace(plain, limits=np.array([0.5, np.inf]))
+    if kind == "hand alone":
+        plant = plain.plant
+        cut = {"E": plant.E[:4, :4], "A": plant.A[:4, :4], "B": plant.B[:4], "C": plant.C[:, :4], "f": plant.f[:4]}
+        hand = replace(plant, **cut, S_q=plant.S_q[:, :4], S_v=plant.S_v[:, :4])
+        return replace(plain, K=plain.K[:, :4], x_bar=plain.x_bar[:4], plant=hand)
+    assert observed or kind == "plain"
+    return plain
+
+
+def make(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["make", "-C", str(folder), *words], capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize("kind", ["plain", "limited", "hand alone", "late"])
+def test_c_gives_our_own_loads(kind: str, tmp_path: Path) -> None:
+    """Silent with all warnings as errors and with the sanitizers; a hand that is not measured is withstood."""
+    own = controller(kind)
+    write_controller(own, tmp_path)
+    done = make(tmp_path, "test")
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
+    found = re.findall(
+        r"400 ticks: .* load (\S+), allowed 1e-12; (\d) with lost samples, 0 held; .* withstood", done.stdout
+    )
+    assert len(found) == 2
+    assert all(float(digits) <= 1e-12 for digits, _ in found)
+    assert {lost for _, lost in found} == {"2" if kind == "late" else "0"}
+    if kind == "limited":
+        loads = [line.split()[-2:] for line in (tmp_path / "golden.log").read_text().splitlines() if "tick" in line]
+        assert max(abs(float.fromhex(x)) for x, _ in loads) == 0.5
+
+
+def test_the_test_finds_a_wrong_digit(tmp_path: Path) -> None:
+    """One entry of the gain off by 1e-9 of itself."""
+    own = controller("plain")
+    wrong = own.K.copy()
+    wrong[0, 0] *= 1 + 1e-9
+    write_controller(replace(own, K=wrong, u_bar=own.u_bar + (wrong - own.K) @ own.x_bar), tmp_path)
+    text = (tmp_path / "controller_data.h").read_text()
+    write_controller(own, tmp_path)
+    (tmp_path / "controller_data.h").write_text(text)
+    assert make(tmp_path, "test_controller").returncode == 0
+    done = subprocess.run(["./test_controller", "golden.log"], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, "bad samples withstood" in done.stdout) == (1, True)
+
+
+def test_nothing_is_called_and_a_million_ticks_pass(tmp_path: Path) -> None:
+    write_controller(controller("late"), tmp_path)
+    subprocess.run(["cc", "-std=c99", "-O3", "-c", "controller.c"], cwd=tmp_path, check=True)
+    names = subprocess.run(["nm", "-u", "controller.o"], cwd=tmp_path, check=True, capture_output=True, text=True)
+    assert set(names.stdout.split()) <= {
+        "U",
+        "memcpy",
+        "memset",
+        "memmove",
+        "__stack_chk_fail",
+        "_GLOBAL_OFFSET_TABLE_",
+    }
+    done: Any = make(tmp_path, "time")
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"N = \d+: a tick takes .*; 0 held", done.stdout)
