@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lu_factor, lu_solve
 
 from softgrasp.fem.errors import SolverError
+from softgrasp.fem.obstacles.small import RIDGE
 
 Array = NDArray[Any]
 OPEN, STICK, FORWARD, BACK = range(4)  # sets; FORWARD: x_t = mu x_n, BACK: x_t = -mu x_n
@@ -93,6 +94,7 @@ class Coulomb:
             return x
         if kind.tobytes() != self.sets:
             matrix = self.W[np.ix_(rows, rows)]
+            matrix[np.diag_indices(len(rows))] *= 1 + RIDGE
             matrix[:, : len(on)] += self.W[np.ix_(rows, k + on)] * share[on]
             self.factor, self.sets = lu_factor(matrix, overwrite_a=True, check_finite=False), kind.tobytes()
         x[rows] = lu_solve(self.factor, -q[rows], check_finite=False)
