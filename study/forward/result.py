@@ -13,7 +13,7 @@ from softgrasp.study.report import Table
 from softgrasp.study.report.origin import origin, peak_memory_mb
 
 if TYPE_CHECKING:
-    from softgrasp.fem.run.contact_record import ContactRecord
+    from softgrasp.fem.run.contact.record import ContactRecord
     from softgrasp.fem.strain.newton import NewtonFigures
 
 

@@ -11,7 +11,7 @@ import pytest
 from softgrasp.fem.errors import Paused, SceneError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.obstacles.coulomb import Coulomb
-from softgrasp.fem.run.contact_friction import FrictionContact
+from softgrasp.fem.run.contact.friction import FrictionContact
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.scene.file import load_scene
 

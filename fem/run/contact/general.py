@@ -31,8 +31,8 @@ from softgrasp.fem.obstacles.obstacle import Obstacle, check_passage, mean_norma
 from softgrasp.fem.obstacles.responses import Responses
 from softgrasp.fem.obstacles.small import SmallProblem
 from softgrasp.fem.petsc import Array, rows_on_all, total
-from softgrasp.fem.run.contact_impulse import stopping_impulse
-from softgrasp.fem.run.contact_record import ContactRecord, Tables
+from softgrasp.fem.run.contact.impulse import stopping_impulse
+from softgrasp.fem.run.contact.record import ContactRecord, Tables
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive

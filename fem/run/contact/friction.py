@@ -18,7 +18,7 @@ from softgrasp.fem.obstacles import HalfSpace
 from softgrasp.fem.obstacles.coulomb import OPEN, STICK, Coulomb
 from softgrasp.fem.obstacles.obstacle import Obstacle
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.contact import Contact, Flags, Ints, Rows
+from softgrasp.fem.run.contact.general import Contact, Flags, Ints, Rows
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint
 from softgrasp.fem.run.motion import ForceDrive, TableDrive
@@ -39,7 +39,7 @@ class RubbingRows(Rows):
 
 
 class FrictionContact(Contact):
-    """Contact of one run in which an obstacle has friction, see :class:`softgrasp.fem.run.contact.Contact`."""
+    """Contact of one run in which an obstacle has friction, see :class:`softgrasp.fem.run.contact.general.Contact`."""
 
     rows: RubbingRows
 

@@ -16,7 +16,7 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles import HalfSpace
 from softgrasp.fem.obstacles.compiled import contact_library
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.contact import MOST, ROUNDING, STILL, Contact, Ints, Rows, unsettled
+from softgrasp.fem.run.contact.general import MOST, ROUNDING, STILL, Contact, Ints, Rows, unsettled
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive
@@ -26,7 +26,7 @@ KINDS = {np.dtype(float): "double[]", np.dtype(np.intc): "int[]", np.dtype(bool)
 
 
 class FlatContact(Contact):
-    """Contact of one run with half-spaces, see :class:`softgrasp.fem.run.contact.Contact`; there must be a compiler."""
+    """`Contact` of one run with half-spaces; there must be a compiler."""
 
     def __init__(self, model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> None:
         super().__init__(model, midpoint, steps, hand)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles.compiled import contact_library
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.contact import Contact
-from softgrasp.fem.run.contact_flat import FlatContact
+from softgrasp.fem.run.contact.flat import FlatContact
+from softgrasp.fem.run.contact.general import Contact
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive
 
@@ -67,7 +67,7 @@ def make_contact(
     obstacles = model.scene.obstacle or []
     kind: type[Contact] = Contact
     if any(entry.friction for entry in obstacles):
-        from softgrasp.fem.run.contact_friction import FrictionContact  # only scenes with friction pay for it
+        from softgrasp.fem.run.contact.friction import FrictionContact  # only scenes with friction pay for it
 
         kind = FrictionContact
     elif {entry.kind for entry in obstacles} == {"halfspace"} and contact_library() is not None:
