@@ -16,7 +16,8 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles import HalfSpace
 from softgrasp.fem.obstacles.compiled import contact_library
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.contact.general import MOST, ROUNDING, STILL, Contact, Ints, Rows, unsettled
+from softgrasp.fem.run.contact.general import MOST, ROUNDING, STILL, Contact, unsettled
+from softgrasp.fem.run.contact.rows import Ints, Rows
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive

@@ -18,7 +18,8 @@ from softgrasp.fem.obstacles import HalfSpace
 from softgrasp.fem.obstacles.coulomb import OPEN, STICK, Coulomb
 from softgrasp.fem.obstacles.obstacle import Obstacle
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.contact.general import Contact, Flags, Ints, Rows
+from softgrasp.fem.run.contact.general import Contact
+from softgrasp.fem.run.contact.rows import Flags, Ints, Rows
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint
 from softgrasp.fem.run.motion import ForceDrive, TableDrive

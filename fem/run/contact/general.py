@@ -16,8 +16,7 @@ rounds on the small problem alone. A two-way hand feels N_s'x, N_s = N T.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +32,7 @@ from softgrasp.fem.obstacles.small import SmallProblem
 from softgrasp.fem.petsc import Array, rows_on_all, total
 from softgrasp.fem.run.contact.impulse import stopping_impulse
 from softgrasp.fem.run.contact.record import ContactRecord, Tables
+from softgrasp.fem.run.contact.rows import Flags, Ints, Rows
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive
@@ -41,26 +41,6 @@ ROUNDING = 64 * float(np.finfo(float).eps)  # of a gap, over the coordinates it 
 STILL = 1e-12  # normal velocity of pressed nodes over the largest velocity on the boundary, which is rounding [1]
 MOST = 200  # rounds of a step
 STRAIGHT = 1e-8  # motion of a node over the size of the body below which its normal does not turn [1]
-Ints = NDArray[np.intp]
-Flags = NDArray[np.bool_]
-
-
-@dataclass
-class Rows:
-    """Contact rows of a step: a boundary node before an obstacle each, with its force."""
-
-    obstacle: Ints  # number of the obstacle, (k,)
-    node: Ints  # number of the boundary node, (k,)
-    normal: Array  # mean normal of the step, (k, d)
-    x: Array  # force along it [N], (k,)
-
-    def take(self, on: Flags) -> Self:
-        """Those of the rows that are ``on``, (k,)."""
-        return type(self)(*(getattr(self, field.name)[on] for field in fields(self)))
-
-    def forces(self) -> Array:
-        """Forces on the nodes, (k, d) [N]."""
-        return self.x[:, None] * self.normal
 
 
 def unsettled(reached: float) -> SolverError:
