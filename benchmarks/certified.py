@@ -53,11 +53,11 @@ at the material, propagator, steps. A fast look: --cells 15."""
 class AnswerCost:
     """One way to an answer on one mesh; None where a number does not apply."""
 
-    cells: int  # of the short side
+    cells: int  # cells of the short side
     answer: str
     ms: float  # CPU time
     plain: float | None = None  # CPU time without the proof [ms]
-    share: float | None = None  # of the proof in it
+    share: float | None = None  # share of the proof in the time of an answer
     stepped: float | None = None  # the reduced run in state space [ms]
     of_stepped: float | None = None  # proof over that
     of_full: float | None = None  # answer over the full run

@@ -32,7 +32,7 @@ Repeats = Annotated[int, typer.Option(help="repeats behind each median", min=1)]
 class Failure:
     """A row without numbers."""
 
-    label: str  # what was to be measured
+    label: str  # name of the measurement
     ranks: int
     error: str  # why there is nothing
 

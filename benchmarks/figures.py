@@ -57,8 +57,8 @@ def craig_bampton(key: str) -> Callable[[Row], float]:
 class Number:
     """One number of a figure."""
 
-    text: str  # what it is, with its unit
-    read: Callable[[Row], float]  # from what the command wrote
+    text: str  # meaning, with its unit
+    read: Callable[[Row], float]  # function from the results of a command to the number
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Command:
     """A command and the figures that it prints."""
 
     name: str  # argument of --only
-    line: str  # as a user types it, without --out
+    line: str  # command line without --out
     figures: tuple[Figure, ...]
     file: str = "result.json"  # file of the numbers, relative to the folder of results
 

@@ -46,7 +46,7 @@ machine quiet."""
 class MeshRow:
     """One mesh; times in seconds."""
 
-    cells: int  # of the short side
+    cells: int  # cells of the short side
     n_e: int  # tissue unknowns
     time_factor: float  # factorisation of the full run
     time_full: float  # all steps of the full run
@@ -56,7 +56,7 @@ class MeshRow:
     N: int  # its dimension
     error: float  # |X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e]
     error_deformation: float  # |X - X_r|_F / |X|_F of X = [z, v_z]
-    stable: bool  # of the reduced model
+    stable: bool  # whether the reduced model is stable
 
 
 def block(n_e: int, steps: int, method: str, N: int) -> Scene:

@@ -62,8 +62,8 @@ class OutputBounds:
     sizes: str  # modes of the answer, and of the basis that certifies it
     materials: int  # number tested
     below: int  # number of materials at which a bound lies below the truth at some step
-    median: float  # of bound over truth
-    most: float  # of bound over truth
+    median: float  # median of bound over truth
+    most: float  # largest bound over truth
     plain: float  # median of the bound without duals over the truth
     answer_ms: float  # processor time of an answer [ms]
     plain_ms: float  # processor time of an answer without duals [ms]

@@ -38,9 +38,9 @@ class ScaleCost:
     cells: int  # triangles or tetrahedra
     ranks: int  # number of ranks
     solver: str  # solver of the steps
-    iterations: float  # of a step; 0 by a factor
-    seconds: dict[str, float]  # of each stage [s]
-    modelled: dict[str, float]  # of each stage [s]
+    iterations: float  # iterations of a step; 0 by a factor
+    seconds: dict[str, float]  # time of each stage [s]
+    modelled: dict[str, float]  # modelled time of each stage [s]
     memory_mb: float  # peak of all ranks [MiB]
     memory_modelled_mb: float  # peak of all ranks by the cost model [MiB]
     memory_base_mb: float  # memory of the libraries alone, of all ranks [MiB]

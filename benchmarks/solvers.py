@@ -36,7 +36,7 @@ class Row:
     kind: str  # dimension and order
     n_e: int  # unknowns
     solver: SolverName
-    iterations: int  # of a solve; 0 by a factor
+    iterations: int  # iterations of a solve; 0 by a factor
     setup: float  # processor time [s]
     solve: float  # processor time, the median [s]
     setup_ratio: float  # measured over modelled

@@ -17,7 +17,7 @@ AXES, TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
 class OutputColumn:
     """One component of an output, or one degree of freedom of the hand."""
 
-    name: str  # of the output, "tip"
+    name: str  # name of the output, "tip"
     axis: str = ""  # x, y, z of a displacement, rx, ry, rz of a rotation; empty for a number without direction
 
     @property

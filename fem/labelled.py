@@ -19,10 +19,10 @@ class Quantity:
     """One quantity of a run over time, by components."""
 
     values: Array  # (times, components)
-    labels: tuple[str, ...]  # of the components
-    units: tuple[str, ...]  # of the components
-    dimension: str  # what the components are: "output" or "hand"
-    mid: bool = False  # at the middle of each step, one row less than the times
+    labels: tuple[str, ...]  # labels of the components, (components,)
+    units: tuple[str, ...]  # units of the components, (components,)
+    dimension: str  # kind of the components: "output" or "hand"
+    mid: bool = False  # whether a row is at the middle of a step: one row less than the times
 
 
 def package(name: str) -> Any:

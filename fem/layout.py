@@ -24,7 +24,7 @@ class Patches:
     """
 
     star: NDArray[Any]  # number of a star of this rank, ascending, for each node in it, (pairs,)
-    node: NDArray[Any]  # that node, (pairs,)
+    node: NDArray[Any]  # node of the star, (pairs,)
     row: NDArray[Any]  # an owned node where a linear function is not zero, (entries,)
     column: NDArray[Any]  # the vertex of that function, (entries,)
     weight: Array  # its value there [1], (entries,)

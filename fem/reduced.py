@@ -273,6 +273,19 @@ class ReducedSystem(StateSpace):
         D = np.zeros((len(self.C), B.shape[1]))
         return control.ss(A, B, self.C, D, remove_useless_states=False, **names)
 
+    def to_drake(self, dt: float) -> Any:
+        """Midpoint steps of dt [s] as ``pydrake.systems.primitives.LinearSystem`` of discrete time.
+
+        Raises ReducedSystemError: Drake is not installed.
+        """
+        try:
+            primitives: Any = import_module("pydrake.systems.primitives")  # as above
+        except ImportError as error:
+            raise ReducedSystemError("Drake is not installed; `pip install drake` brings it") from error
+        steps = self.midpoint(dt).matrix
+        D = np.zeros((len(self.C), self.n_s))
+        return primitives.LinearSystem(steps[:, : self.N], steps[:, self.N : -1], self.C, D, dt)
+
     def to_pymor(self) -> Any:
         """The system as ``pymor.models.iosys.LTIModel``, in programs of one rank.
 

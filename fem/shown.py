@@ -85,3 +85,10 @@ def listed(names: Iterable[str], most: int = 6) -> str:
     names = tuple(names)
     shown = names if len(names) <= most else (*names[: most - 1], f"{len(names) - most + 1} more")
     return ", ".join(shown) or "none"
+
+
+def percent(share: float) -> str:
+    """A share as a percentage of two digits; "> 9999 %" also where it is not finite."""
+    if not share < 100:
+        return "> 9999 %"
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"

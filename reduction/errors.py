@@ -104,7 +104,7 @@ def shown_rows(view: View, model: ReducedModel, small: EnergySystem, system: Blo
 class Span:
     """Snapshots in the columns of one orthonormal basis, X = Q C + rest."""
 
-    comm: MPI.Intracomm
+    comm: MPI.Intracomm  # ranks of the rows
     Q: Array  # local rows (rows, k)
     C: Array  # (k, m), on every rank
     rest: float  # |X - Q C|_F^2
@@ -163,8 +163,8 @@ class ModelComparison:
 
     model: ReducedModel  # largest model of the family
     small: EnergySystem  # its system at the parameter of the snapshots
-    system: BlockSystem  # of the full run
-    snapshots: Snapshots  # of the full run
+    system: BlockSystem  # system of the full run
+    snapshots: Snapshots  # snapshots of the full run
     energy: Array  # :func:`full_energy` of the snapshots
     _spans: dict[View, Span] = field(default_factory=dict, repr=False)
     # views of the last model, in the span of each view

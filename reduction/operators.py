@@ -58,7 +58,7 @@ def symmetric(X: Array) -> Array:
 class Parameters:
     """Everything online assembly depends on."""
 
-    materials: tuple[LayerMaterial, ...]  # one per layer
+    materials: tuple[LayerMaterial, ...]  # materials, one per layer
     gravity: Array | None = None  # acceleration of free fall in the hand's degrees of freedom, (n_s,) [m/s^2]
     alpha: float = 0.0  # mass-proportional damping [1/s]
     damped: bool = False  # damping terms exist

@@ -82,7 +82,7 @@ class StepCoordinates:
 class Modal:
     """Steps of w = [pairs; still; free], mode by mode."""
 
-    angle: Array  # of a step, one a pair (m,)
+    angle: Array  # angle of a step, one for each pair [rad], (m,)
     # from i inputs and a constant 1 to dt g / (1 - i omega dt / 2), real and imaginary rows by turns, (2 m, i + 1)
     load: Array
     rest: Array  # from i inputs and a constant 1 to dt g of all other coordinates, (still + free, i + 1)
@@ -138,7 +138,7 @@ class Propagator(MidpointSteps):
     A conservative model also has ``modal``, which runs without a matrix of the steps.
     """
 
-    model: EnergySystem  # what it steps
+    model: EnergySystem  # system that it steps
     at: StepCoordinates  # coordinates, x = X w
     driven: bool = False  # the hand is prescribed: w has the tissue only, and the inputs are the hand's in a step
     modal: Modal | None = None  # the step mode by mode, for conservative models

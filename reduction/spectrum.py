@@ -25,7 +25,7 @@ SKEW_TOLERANCE = 1e-8  # a conservative block is skew in energy coordinates; the
 class Spectrum:
     """Eigenvalues that decide on stability."""
 
-    eigenvalues: np.ndarray  # of E x' = A x without the zeros of the free hand, complex [1/s]
+    eigenvalues: np.ndarray  # eigenvalues of E x' = A x without the zeros of the free hand [1/s]
     abscissa: float  # largest real part [1/s]; exactly 0 for a conservative block
     zeros: int  # number of eigenvalues set apart
     tolerance: float  # growth rate [1/s] up to which the model counts as stable

@@ -37,7 +37,7 @@ class Outputs:
 
     C_z: Array  # part of the tissue relative to the hand, (p, N)
     C_s: Array  # rigid part, (p, n_s)
-    names: tuple[str, ...] = ()  # one per component
+    names: tuple[str, ...] = ()  # names of the outputs, (p,)
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from softgrasp.lqr.spectrum.certificate import abscissa as abscissa
     from softgrasp.reduction.archive import load as load
     from softgrasp.reduction.archive import save as save
+    from softgrasp.reduction.contact.model import contact_model as contact_model
     from softgrasp.reduction.gradient import gradient as gradient
     from softgrasp.reduction.identify.identify import identify as identify
     from softgrasp.reduction.reduce import errors as errors
@@ -57,6 +58,7 @@ _FACE = {
     "errors": "reduction.reduce",
     "gradient": "reduction.gradient",
     "identify": "reduction.identify.identify",
+    "contact_model": "reduction.contact.model",
     "save": "reduction.archive",
     "load": "reduction.archive",
     "problem": "lqr.design",

@@ -15,12 +15,11 @@ from typing import Annotated, Any
 import typer
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.study.export.command import export
 from softgrasp.study.shell.ending import console, rank, run_command
 from softgrasp.study.shell.folder import default_folder
 from softgrasp.study.shell.options import parse_tolerance, takes
 
-LIST_WIDTH = 200  # [letters]
-FOREIGN = 5  # files that a list of runs leaves out by name
 RUN, MODEL, LOOK = "Run a scene", "Reduce, control and study", "Scenes, results and installation"  # groups of --help
 EPILOG = """[bold]Examples[/bold]
 
@@ -75,7 +74,7 @@ def doctor() -> None:
 
 @app.command(rich_help_panel=LOOK)
 def scenes() -> None:
-    """List the scenes that ship, with what they show."""
+    """List the scenes that ship, with their descriptions."""
     from rich.table import Table
 
     from softgrasp.fem.scene.file import load_scene, shipped_scenes
@@ -83,7 +82,7 @@ def scenes() -> None:
     shipped = shipped_scenes()
     if not shipped:
         raise SceneError("no scenes here: they ship with the checkout, in demos/scenes")
-    table = Table("scene", "what it shows", box=None, pad_edge=False)
+    table = Table("scene", "description", box=None, pad_edge=False)
     for name, path in shipped.items():
         table.add_row(name, load_scene(path).description)
     console().print(table)
@@ -118,17 +117,10 @@ def new(
 @app.command("list", rich_help_panel=LOOK)
 def list_runs(folder: Annotated[Path, typer.Argument(help="folder that the runs lie below")] = Path("out")) -> None:
     """List the runs below a folder, the newest last."""
-    from softgrasp.study.runs.listing import runs_below
+    from softgrasp.study.runs.listing import show_runs
 
     if rank() == 0:
-        wide = console()
-        wide.width = max(wide.width, LIST_WIDTH)  # a narrower terminal breaks the lines, but loses nothing
-        runs, foreign = runs_below(folder)
-        wide.print(runs.terminal())
-        for file in foreign[:FOREIGN]:
-            wide.print(f"left out: {file} is damaged or not of softgrasp", soft_wrap=True, markup=False)
-        if len(foreign) > FOREIGN:
-            wide.print(f"and {len(foreign) - FOREIGN} more")
+        show_runs(folder, console())
 
 
 @app.command(rich_help_panel=LOOK)
@@ -274,7 +266,7 @@ def query(
     out: Path | None = None,
     empty: bool = False,
 ) -> None:
-    """Ask a certified reduced model for other materials, motions or steps, and how far the answer can be off.
+    """Ask a certified reduced model for other materials, motions or steps; an answer comes with its errors.
 
     An answer has three errors: of the reduction (proved), of the time step and of the mesh (both estimates).
 
@@ -333,35 +325,7 @@ def identify(
         refine=refine, columns=columns, **shared))  # fmt: skip
 
 
-@app.command(rich_help_panel=MODEL)
-def export(
-    model: Annotated[
-        Path,
-        typer.Argument(help="reduced model of `softgrasp reduce` or sg.save (.h5), or controller of `control` (.npz)"),
-    ],
-    c: Annotated[
-        Path | None, typer.Option("--c", metavar="FOLDER", help="write C99 with its test into this folder")
-    ] = None,
-    fmu: Annotated[
-        Path | None, typer.Option(help="write a file of FMI 3.0 for Simulink, Modelica and others, e.g. plant.fmu")
-    ] = None,
-    tick: Annotated[float, typer.Option(help="time step of a model in seconds; a controller has its own")] = 1e-3,
-) -> None:
-    """Write a reduced model or a controller for other programs: C99 for a robot, an FMU for simulators.
-
-    Of a model, the load on the hand goes in, hand and outputs of the scene come out; mu, lambda and beta may change at
-    any tick. Of a controller, the measured hand and the samples of its observer go in, the load comes out.
-
-    The C allocates nothing and calls no library. It brings a log of our own steps, which `make test` compares.
-
-    The FMU (FMI 3.0, co-simulation and model exchange) holds the same C and a binary for this machine.
-
-    Example: softgrasp reduce paper_forward, then
-    softgrasp export out/paper_forward-reduce/models/craig_bampton.h5 --c plant --fmu plant.fmu; make -C plant test time
-    """
-    from softgrasp.study.export.run import run_export
-
-    run_export(model, console(), c=c, fmu=fmu, tick=tick)
+app.command(rich_help_panel=MODEL)(export)
 
 
 @app.command(rich_help_panel=MODEL)

@@ -127,6 +127,7 @@ def small(words: list[str]) -> list[str]:
 def test_every_command_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On small meshes, in the order of the pages: later commands look at what earlier ones left."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "demos").symlink_to(ROOT / "demos")
     for display in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(display, raising=False)
     (strip,) = [text for name, text in PYTHON if "strip.vtu" in text]
@@ -173,6 +174,7 @@ def test_python_of_a_page_runs(name: str, text: str, tmp_path: Path, monkeypatch
     from softgrasp.reduction.bases.registry import METHODS
 
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "demos").symlink_to(ROOT / "demos")
     known = dict(METHODS)
     try:
         exec(compile(text, name, "exec"), {"__name__": "__main__"})

@@ -37,9 +37,9 @@ def run_seconds(model: Model) -> float:
 class Plan:
     """One way to estimate the error of a mesh, an argument of :func:`softgrasp.fem.accuracy.estimate.estimate`."""
 
-    seconds: float  # what it takes
+    seconds: float  # modelled time of the estimate [s]
     surplus: bool = False  # iterations on the next order instead of solves
-    cells: list[int] | None = None  # of the coarser box that is estimated instead
+    cells: list[int] | None = None  # cells of the coarser box that is estimated instead
 
     @property
     def how(self) -> dict[str, Any]:

@@ -16,9 +16,9 @@ SMALL_SHARE = 0.01  # of the volume: at the edge of the contact zone the strain 
 class Gradient:
     """Frobenius norm |grad z| of a displacement against the hand, rotations included, between vertices of a cell."""
 
-    largest: float  # in any cell [1]; at the edge of the contact zone it grows with every refinement
+    largest: float  # largest |grad z| of all cells [1]; at the edge of the contact zone it grows with every refinement
     typical: float  # smallest number that at most `SMALL_SHARE` of the volume exceeds [1]
-    share: float  # of the volume above `SMALL_STRAIN` [1]
+    share: float  # share of the volume above `SMALL_STRAIN` [1]
     rms: float  # root of its mean square over the volume [1]
 
     @property
@@ -34,7 +34,7 @@ class Sag:
     # acceleration of gravity (d,) [m/s2]; without gravity in the scene that of the earth, along the last axis
     g: tuple[float, ...]
     largest: float  # largest |z| of a node [m]
-    gradient: Gradient  # of z
+    gradient: Gradient  # gradient of z
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,11 @@ class Gate:
     """A dimensionless number that decides whether an effect matters."""
 
     number: float  # its value, dimensionless
-    symbol: str  # how it is computed
+    symbol: str  # formula of the number
     threshold: float  # value above which the effect matters
     matters: bool  # the effect changes what this scene computes; for an effect that is off: it would
     sentence: str  # the finding in words
-    proviso: str = ""  # on what it hangs that the effect matters; empty when on nothing
+    proviso: str = ""  # condition under which the effect matters, in words; empty for none
     condition: str = ""  # what decides beside the number, wherever ``matters`` is not number > threshold; else empty
 
     @property
@@ -65,7 +65,7 @@ class Problem:
     scene: Scene
     dimension: int  # 2 or 3
     length: float  # largest extent of the tissue [m]
-    materials: tuple[LayerMaterial, ...]  # one per layer that has cells
+    materials: tuple[LayerMaterial, ...]  # materials, one per layer that has cells
     tissue_mass: float  # mass of the whole tissue [kg]
     # moments of inertia of the rigid tissue about the reference, one per rotation [kg m2]
     tissue_inertia: tuple[float, ...]
@@ -81,9 +81,9 @@ class Effect(ABC):
     """One unit of physics that a scene switches on."""
 
     name: str  # its key
-    term: str  # what it adds to the equation
+    term: str  # term of the equation that it adds
     cost: str  # operators and work that it adds, one sentence
-    threshold: float  # of its number, where that does not depend on the scene
+    threshold: float  # threshold of its number, where that does not depend on the scene
 
     def active(self, scene: Scene) -> bool:
         """Whether the scene has it on."""

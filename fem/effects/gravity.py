@@ -24,7 +24,7 @@ class GravityEffect(Effect):
 
     name = "gravity"
     term = "f_e = G g, as the load -G (q_s'' - g)"
-    cost = "Gravity needs no operator and no work in a step: G multiplies q_s'' - g instead of q_s''."
+    cost = "Gravity adds no work in a step: G multiplies q_s'' - g instead of q_s''."
     threshold = 0.01
 
     def gate(self, problem: Problem) -> Gate:

@@ -29,7 +29,7 @@ class Field:
     """One array of a grid."""
 
     name: str  # as ParaView displays it; empty where the place in the file determines it
-    unit: str  # as "m/s"
+    unit: str  # unit, "m/s"
     values: npt.NDArray[np.generic]  # shape (n,) or (n, components)
 
     def block(self) -> bytes:

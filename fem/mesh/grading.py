@@ -183,7 +183,7 @@ class BoxAxis:
     """One axis of a box."""
 
     cuts: tuple[float, ...]  # coordinates that a line must meet, the sides first and last [m]
-    ends: tuple[float, ...]  # those of them where the contact zone ends [m]
+    ends: tuple[float, ...]  # cuts at which the contact zone ends [m]
 
 
 def box_axes(scene: Scene) -> tuple[BoxAxis, ...]:

@@ -30,7 +30,7 @@ class Ends:
     at: Floats  # coordinates of the points, (n, 1, 2), or of both ends of the edges, (n, 2, 3) [m]
     angle: Floats  # angle of the body there, (n,) [rad]
     alpha: Floats  # real part of the exponent, (n,) [1]; 1/2 is assumed at ends of layers, where both materials decide
-    kind: tuple[Kind, ...]  # what the end is, n words
+    kind: tuple[Kind, ...]  # kind of each end, n words
 
     def distance(self, x: Floats) -> Floats:
         """Distance of points (n, d) from the nearest end [m], (n,); inf if there is none."""

@@ -35,7 +35,7 @@ class MeshArrays:
 class Whole:
     """A simplex mesh on one rank with the marks of its cells and facets."""
 
-    mesh: dolfinx.mesh.Mesh  # on MPI.COMM_SELF
+    mesh: dolfinx.mesh.Mesh  # whole mesh on MPI.COMM_SELF
     source: str  # name of the mesh, for messages
     cells: dict[str, Ints]  # mark of each cell, (n_cells,), for the fields cell_tags and layers of TissueMesh
     facets: dict[str, dolfinx.mesh.MeshTags]  # marks of facets for the fields facet_tags and contact of TissueMesh

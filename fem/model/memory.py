@@ -31,8 +31,8 @@ class Need:
     """Estimated memory [byte]."""
 
     mesh: float  # mesh, forms and matrices, spread over the ranks
-    factor: float  # of the matrix of a step, over all ranks
-    tables: float  # of hand, loads and outputs over the steps, on every rank
+    factor: float  # memory of the factor of a step's matrix, over all ranks [byte]
+    tables: float  # memory of the tables of hand, loads and outputs over the steps, on every rank [byte]
 
     def of(self, share: float, ranks: int) -> float:
         """Memory of ``ranks`` ranks with this share of the tissue [byte]."""

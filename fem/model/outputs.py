@@ -22,7 +22,7 @@ class Output:
     """One named output y = C_e z + C_s q_s with d (or, for the hand, n_s) components [m; angles rad]."""
 
     name: str  # label in tables and files
-    columns: Columns  # one per component
+    columns: Columns  # label and unit of each component
     dofs: np.ndarray  # local tissue dofs that enter, shape (k, size); empty on ranks that own none
     weight: float  # every listed dof enters with this factor
     C_s: Array  # rigid part, (size, n_s), on every rank

@@ -44,9 +44,9 @@ class Profile:
     """Time law of the hand: a rest-to-rest quintic to a target (0: at rest), or a table that a CSV file gave."""
 
     drive: Literal["motion", "force"]  # columns: the motion of the hand, or the force on it
-    end: float  # of the run [s]
-    target: Array  # of the quintic, (n_s,) [m, rad]
-    duration: float  # of the quintic [s]
+    end: float  # end of the run [s]
+    target: Array  # target of the quintic [m, rad], (n_s,)
+    duration: float  # duration of the quintic [s]
     table: tuple[Array, Array] | None = None  # times (m,) [s] and values (m, n_s) [m, rad; N, N m], or None
 
     @staticmethod

@@ -49,7 +49,7 @@ class NodeOrder:
 class Dissection:
     """An order and the pattern of blocks of d x d in it, for as long as matrices are put in order."""
 
-    order: NodeOrder  # of the nodes
+    order: NodeOrder  # nodes in the order of elimination
     before: tuple[NDArray[Any], NDArray[Any]]  # row pointers and columns of the blocks before
     after: tuple[NDArray[Any], NDArray[Any]]  # row pointers and columns of the blocks in this order
     source: NDArray[np.intp]  # earlier place of each block of ``after``

@@ -89,7 +89,7 @@ class Start:
 class Law(ABC):
     """A law of the material; lam, mu [Pa] are numbers or (Q,)."""
 
-    name: LawName  # as scenes write it
+    name: LawName  # name of the law in scenes
     barrier = True  # W has no value where J <= 0
     least_stretch = 0.0  # principal stretch below which the law is no model of a solid; 0 where there is none
 

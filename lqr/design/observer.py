@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Stopwatch
 from softgrasp.fem.petsc import Array, on_root
@@ -40,7 +41,9 @@ class ObservedControl:
     without: dict[str, float]
     """Abscissa of the whole loop where a marker, or all samples but those of the hand, never arrive [1/s]."""
     full: FullFilter | None
-    """Kalman filter of the full tissue from the markers; None without markers."""
+    """Kalman filter of the full tissue from the markers; None without markers, or where it was not found."""
+    missing: str
+    """Why there is no filter of the full tissue; empty where there is one, or no marker."""
     sd_full: Array | None
     """Standard deviation of the outputs, relative to the hand, by the full filter [m, rad], (o,)."""
     loop: ModalLoop
@@ -59,9 +62,7 @@ def observe(design: Design, watch: Stopwatch) -> ObservedControl:
         design: the optimal feedback of the scene.
         watch: records the seconds of "full filter" and "observer".
 
-    Raises:
-        ControlError: the plant has no observer, or none that leaves the full plant stable.
-        SolverError: the dual Riccati equation did not converge.
+    Raises ControlError: the plant has no observer, or none that leaves the full plant stable.
     """
     problem, given, loop_of = design.problem, control_of(design.model).observer, control_of(design.model).loop
     assert given is not None
@@ -71,11 +72,14 @@ def observe(design: Design, watch: Stopwatch) -> ObservedControl:
     acting = given.disturbance
     disturbance = make_disturbance(problem, acting.hand, acting.load, acting.box)
     period = 1 / loop_of.rate
-    full, sd_full = None, None
+    full, sd_full, missing = None, None, ""
     if given.markers:
         with watch.stage("full filter"):
-            full = full_filter(problem, sensors, disturbance, period)
-            sd_full = full.sd_of(problem, problem.C_z)
+            try:
+                full = full_filter(problem, sensors, disturbance, period)
+                sd_full = full.sd_of(problem, problem.C_z)
+            except (ControlError, SolverError) as error:  # the filter that runs does without it
+                missing = str(error)
     with watch.stage("observer"):
         loop = ModalLoop(problem, DENSE_LIMIT)
         ticks = make_ticks(problem, loop, sensors, disturbance, period)
@@ -91,7 +95,7 @@ def observe(design: Design, watch: Stopwatch) -> ObservedControl:
                 f"{judged.abscissa:.3g}/s; raise control.observer.N, or lower control.Q for a slower loop"
             )
         without = on_root(problem.layout.comm, lambda: _without(ticks, controller, sensors))
-    return ObservedControl(controller, sensors, reduced, weight, judged, without, full, sd_full, loop, ticks)
+    return ObservedControl(controller, sensors, reduced, weight, judged, without, full, missing, sd_full, loop, ticks)
 
 
 def _check(design: Design) -> None:

@@ -32,7 +32,7 @@ class BasisGains:
 
     name: str  # key of softgrasp.lqr.reduced.bases.BASES
     family: BasisFamily | None  # its bases; None when the basis is refused
-    reports: tuple[GainReport, ...]  # one gain per order, by ascending order
+    reports: tuple[GainReport, ...]  # quality of the gain at each order, ascending
     refused: str = ""  # why the basis is refused; empty when it is not
 
     def best(self, largest: int | None = None, least: int = 0) -> GainReport | None:

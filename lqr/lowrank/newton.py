@@ -40,7 +40,8 @@ class Iteration:
     solves: int = 0  # number of tissue solves
     factor: tuple[Block, Array] | None = None  # (U, signs) with R_j = U diag(signs) U'; None before the first step
     achieved: float = np.inf  # relative Riccati residual of the last finished step
-    history: list[dict[str, float]] = field(default_factory=list)  # one dictionary per solve
+    # residual and shift of each solve, one dictionary each
+    history: list[dict[str, float]] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)  # time by stage [s]
 
 

@@ -33,7 +33,7 @@ class Iterate:
     Z: Block  # factor X ~ Z Z' in costate form, hand (2 n_s, rank), local rows (2 n_local, rank)
     gain: Block  # K' = (B'XE)' with unscaled z-row, hand (2 n_s, m), local rows (2 n_local, m)
     about: str  # method, order and kind of tissue solver, in words
-    history: list[dict[str, float]]  # one dictionary per iteration
+    history: list[dict[str, float]]  # residual or change of each iteration, one dictionary each
     counts: dict[str, int]  # number of tissue solves ("solves") and of iterations by name
     seconds: dict[str, float] = field(default_factory=dict)  # time by stage [s]
 

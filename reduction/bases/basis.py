@@ -44,8 +44,8 @@ class Basis:
     V_q: Array  # displacement of the tissue, local rows (n_local, N)
     V_p: Array  # velocity or momentum of the tissue, local rows (n_local, N)
     coordinates: Coordinates = "qv"  # "qv" with velocities, "qp" with momenta
-    frame: Frame = "absolute"  # of the tissue rows: absolute, or relative to the rigid motion of the hand
-    structure: Structure = "none"  # that V or its tissue columns keep
+    frame: Frame = "absolute"  # frame of the tissue rows: absolute, or relative to the rigid motion of the hand
+    structure: Structure = "none"  # structure that V or its tissue columns keep
     fixed_solid: bool = False  # the first 2 n_s columns are the hand's own unit vectors
     # inner product it was built in, see `reduction/bases/inner.py`
     inner: Literal["euclidean", "mass", "energy"] = "euclidean"

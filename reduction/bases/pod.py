@@ -22,7 +22,7 @@ class PartsRequest:
     """What a builder of parts gets."""
 
     states: States  # system and snapshots
-    snapshots: Columns  # in the coordinates and the frame of the method
+    snapshots: Columns  # snapshots in the coordinates and the frame of the method
     hand: bool  # whether the hand's rows are part of the decomposition
     coordinates: Coordinates  # "qv" or "qp"
     inner: InnerName  # inner product

@@ -31,7 +31,7 @@ from softgrasp.reduction.bases.truncation import Part
 class Canonical:
     """Snapshots q~ = Q L^-T C_q and y~ = Q L^-T C_y in the columns of one A-orthonormal basis."""
 
-    rows: Rows  # how one half is stacked
+    rows: Rows  # order in which the rows of one half are stacked
     by: Weight | None  # the weight A, or None
     factor: Factor  # Q and R = [R_q, R_y]
     inverse: Array | None  # L^-T, or None

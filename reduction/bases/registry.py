@@ -42,13 +42,13 @@ class Method:
     """One basis of the registry."""
 
     key: str  # name in scenes and results
-    title: str  # one line for tables and figures
-    paper: str | None  # what the paper calls it, None for those beyond it
+    title: str  # name in tables and figures
+    paper: str | None  # name in the paper; None for those beyond it
     preserving: bool  # the reduced model keeps the Hamiltonian or the second-order structure
-    build: Callable[[PartsRequest], tuple[Part, ...]]  # makes the parts from the snapshots
+    build: Callable[[PartsRequest], tuple[Part, ...]]  # function that makes the parts from the snapshots
     coordinates: Coordinates  # "qv" with velocities, "qp" with momenta
-    frame: Frame  # of the tissue rows: absolute, or relative to the rigid motion of the hand
-    structure: Structure  # that V or its tissue columns keep
+    frame: Frame  # frame of the tissue rows: absolute, or relative to the rigid motion of the hand
+    structure: Structure  # structure that V or its tissue columns keep
     fixed: bool  # the hand's unit columns are kept apart from the decomposition
     pairs: bool  # units are pairs of columns, so N is even
     snapshots: bool = True  # whether it needs any

@@ -17,11 +17,11 @@ PAPER_ENERGY = 0.999  # of the POD functional [SBRH21]
 class Part:
     """Vectors of one quantity in the order of their importance, by units: one column each, or a symplectic pair."""
 
-    title: str  # what it spans, for messages
+    title: str  # quantity that it spans, for messages
     sigma: Array  # importance of the units over ``scale``, descending (singular values)
     total: float  # sum of all sigma^2, also of those that were not computed
     rank: int  # number of units that are more than noise
-    # makes the leading k units; one set of columns per half of the pair. Collective.
+    # function that makes the leading k units, one set of columns per half of the pair; collective
     columns: Callable[[int], tuple[Columns, ...]]
     scale: float = 1.0  # power of two divided out of sigma, so that squares neither overflow nor vanish
     rate: float = 1.0  # weight c between displacement and momentum, see `reduction/bases/inner.py`

@@ -9,6 +9,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import percent
 from softgrasp.reduction.online import ReducedTrajectory
 
 Kind = Literal["proof", "estimate"]
@@ -32,7 +33,7 @@ class ToleranceError(SoftgraspError):
 class Bound:
     """Error of a run at every step."""
 
-    values: Array = field(repr=False)  # at every step, (steps + 1,) or one column for each component
+    values: Array = field(repr=False)  # bound at every step, (steps + 1,), or (steps + 1, p) of each component
     size: float  # largest value of the reduced solution itself, in the norm of the error
     kind: Kind  # "proof": not exceeded; "estimate": about so large
 
@@ -145,18 +146,18 @@ class Certificate:
 
     def sentence(self) -> str:
         """The three numbers in one line."""
-        step = "not known" if self.time_step is None else f"{self.time_step:.1e} (estimate)"
+        step = "not known" if self.time_step is None else f"{percent(self.time_step)} (estimate)"
         mesh = "not known"
         if self.mesh is not None:
             count = len(self.mesh.places)
             where = f"largest of {count} trained materials" if count > 1 else "at one trained material"
-            mesh = f"{self.mesh.largest:.1e} (estimate, {where})"
-        return f"reduction {self.reduction:.1e} ({self.how}) | time step {step} | mesh {mesh}"
+            mesh = f"{percent(self.mesh.largest)} (estimate, {where})"
+        return f"reduction {percent(self.reduction)} ({self.how}) | time step {step} | mesh {mesh}"
 
 
 @dataclass(frozen=True)
 class CertifiedRun:
     """A reduced run and what is known of its error."""
 
-    trajectory: ReducedTrajectory
-    certificate: Certificate
+    trajectory: ReducedTrajectory  # reduced run
+    certificate: Certificate  # its errors

@@ -57,7 +57,7 @@ class OutputDuals:
 
     blocks: SecondOrder  # K_mu, K_lambda, M and G of every layer in W, (L, w, w) and (L, w, n_s)
     C: Array  # outputs in W, (w, p)
-    triangle: Array  # in K_r^-1, of the columns of the static residual norm, then C, then M_1, K_mu, K_lambda of Psi
+    triangle: Array  # triangle in K_r^-1 of [static residual norm's columns, C, M_1, K_mu and K_lambda of Psi]
 
 
 def dual_vectors(model: Model, places: Sequence[Materials], space: ResidualSpace, Phi: Array) -> Array:

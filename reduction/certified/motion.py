@@ -80,7 +80,7 @@ class Motion:
     v_s: Array  # velocity of the hand, (steps + 1, n_s) [m/s, rad/s]
     outputs: Array  # (steps + 1, p) [m, rad]
     size: float  # largest energy norm
-    residual: Residual | None  # of every step; None for runs without a bound
+    residual: Residual | None  # residual of every step; None for runs without a bound
     modes: Modes | None = None  # modes of the run; None where it was not made mode by mode
     w: Array | None = None  # states in the modes, (k, 2, steps + 1); None without modes
     x: Array | None = None  # states x, (steps + 1, N); None with modes

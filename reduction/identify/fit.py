@@ -99,13 +99,18 @@ class Misfit:
 
     def jacobian(self, p: Array) -> Array:
         """Its derivatives, (m, parameters)."""
+        beside = np.vstack([self._nuisance(i, p) for i in range(len(self.experiments))])
+        return np.hstack([self.slopes(p, self.near.unknowns), beside])
+
+    def slopes(self, p: Array, by: Sequence[Unknown]) -> Array:
+        """Derivatives by the logarithms of some parameters, fitted or not, (m, parameters)."""
         small, answers = self.answers(p)
         theta = np.exp(p[: self.k])
         parts = []
         for i, (e, answer) in enumerate(zip(self.experiments, answers, strict=True)):
-            slopes = self.near.slopes(small, theta, answer, e.driven)
-            self.runs += self.k
-            parts.append(np.hstack([np.stack([self.measured(i, y, p) for y in slopes], axis=1), self._nuisance(i, p)]))
+            slopes = self.near.slopes(theta, by, small, answer, e.driven)
+            self.runs += len(by)
+            parts.append(np.array([self.measured(i, y, p) for y in slopes]).reshape(len(by), -1).T)
         return np.vstack(parts)
 
     def _nuisance(self, i: int, p: Array) -> Array:

@@ -26,7 +26,7 @@ from softgrasp.reduction.identify.fit import Fit, Linearisation, Nuisances, by_e
 from softgrasp.reduction.identify.near import check_identifiable, experiment
 from softgrasp.reduction.identify.parts import errors_of_outputs, finer_scene, finer_steps, finer_tolerance
 from softgrasp.reduction.identify.result import Identified
-from softgrasp.reduction.identify.unknowns import parse_unknowns, scene_at, value_of
+from softgrasp.reduction.identify.unknowns import assumed, parse_unknowns, scene_at, value_of
 from softgrasp.reduction.identify.verdict import judge, reasons, unseen, warnings
 
 GROWTH, LARGEST_N = 1.5, 80  # of N while the reduction exceeds the noise
@@ -165,6 +165,9 @@ def _answer(
     return Identified(
         unknowns=unknowns, start=start, values=values, noise=noise, parts=parts, covariance=line.covariance,
         sight=line.sizes, directions=line.directions,
+        assumed={
+            u.name: -line.inverse @ misfit.slopes(found.p, [u])[:, 0] for u in assumed(model, unknowns)
+        },
         nuisances=_nuisances(misfit.nuisances, found.p[k:], line.all_deviations[k:], data, columns),
         residuals=judged,
         reasons=reasons(unknowns, judged, unseen(unknowns, line.sizes, line.directions), noise, parts,

@@ -19,7 +19,7 @@ from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import states_of
 from softgrasp.reduction.gradient import sensitivities
 from softgrasp.reduction.identify.data import Measurements, interpolation
-from softgrasp.reduction.identify.unknowns import Unknown, materials_at
+from softgrasp.reduction.identify.unknowns import Unknown, materials_at, value_of
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory, run
 from softgrasp.reduction.reduce import project_scene
@@ -123,9 +123,12 @@ class Near:
         start = small.equilibrium() if experiment.scene.time.start == "equilibrium" else None
         return run(small, x0=start, **inputs)
 
-    def slopes(self, small: EnergySystem, values: Array, answer: ReducedTrajectory, driven: bool) -> Array:
-        """dy/dlog(values) of a run, (k, steps + 1, p)."""
-        others = [self.system(np.where(np.arange(len(values)) == k, 2 * values, values)) for k in range(len(values))]
+    def slopes(
+        self, values: Array, by: Sequence[Unknown], small: EnergySystem, answer: ReducedTrajectory, driven: bool
+    ) -> Array:
+        """dy/dlog of some parameters of a run at values, (parameters, steps + 1, p)."""
+        own = materials_at(self.rom.materials, self.unknowns, values)
+        others = [self.rom.at(materials_at(own, [u], np.array([2 * value_of(own, u)]))) for u in by]
         return sensitivities(small, others, answer, driven=driven)
 
 

@@ -79,8 +79,8 @@ def finer_scene(scene: Scene, tolerance: float | None, steps: int | None, time_e
     ``time_error``: estimated error of its own steps in the outputs, relative.
     """
     least = max(steps or 0, scene.time.steps)
-    if tolerance is not None and time_error > tolerance:
-        least = max(least, int(scene.time.steps * (2 * time_error / tolerance) ** 0.5) + 1)
+    if tolerance is not None and time_error > MARGIN * tolerance:  # else another mesh may refuse its steps
+        least = max(least, int(scene.time.steps * (time_error / (MARGIN * tolerance)) ** 0.5) + 1)
 
     def edit(table: dict[str, Any]) -> None:
         table["time"]["steps"] = least

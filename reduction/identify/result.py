@@ -39,6 +39,8 @@ class Identified(Shown):
     """Change of the data by a unit of each direction of log(values), (k,) [sigma]."""
     directions: Array
     """Directions of log(values), one a row, the best seen first, (k, k) [1]."""
+    assumed: dict[str, Array]
+    """Change of log(values) by a unit of the logarithm of each parameter that was not fitted, by its name, (k,) [1]."""
     nuisances: tuple[tuple[str, float, float], ...]
     """Name with unit, value and standard deviation of each offset and time shift that was fitted too."""
     residuals: Residuals

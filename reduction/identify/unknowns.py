@@ -70,6 +70,17 @@ def parse_unknowns(names: Sequence[str], model: Model) -> tuple[Unknown, ...]:
     return tuple(found)
 
 
+def assumed(model: Model, unknowns: Sequence[Unknown]) -> tuple[Unknown, ...]:
+    """Parameters of the scene that are not fitted: what the values rest on."""
+    taken = {(u.kind, i) for u in unknowns for i in u.layers}
+    found = []
+    for i, blocks in enumerate(model.system.layers):
+        for kind, key in KINDS.items():
+            if (kind, i) not in taken and getattr(model.system.materials[i], key) > 0:
+                found.append(Unknown(kind if blocks.name == "tissue" else f"{blocks.name}.{kind}", kind, (i,)))
+    return tuple(found)
+
+
 def value_of(materials: Sequence[LayerMaterial], unknown: Unknown) -> float:
     """The value of an unknown."""
     return float(getattr(materials[unknown.layers[0]], KINDS[unknown.kind]))

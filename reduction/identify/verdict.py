@@ -14,6 +14,7 @@ SIGHT = 1.0  # change of the data per log theta, in sigma, below which a directi
 NAMED = 0.3  # of the largest entry of a direction: smaller ones are not named
 LAGS = 10  # of the test for white residuals
 BY_CHANCE = 1e-4  # probability below which residuals are not called white
+ROUNDING = 1e-9  # of a share that is shown
 OUTLIER = 4.0  # [sigma]
 CHANCE = 4.0  # standard deviations of the misfit by chance
 
@@ -32,6 +33,7 @@ class Residuals:
 
 def percent(share: float, sign: str = "") -> str:
     """A share in percent of two digits: "0.37 %", "+530 %"."""
+    share = 0.0 if abs(share) < ROUNDING else share
     return f"{100 * share:{sign}.0f} %" if abs(share) >= 0.1 else f"{100 * share:{sign}.2g} %"
 
 

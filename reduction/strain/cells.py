@@ -25,13 +25,13 @@ BLOCK = 1 << 20  # entries of H at a time
 class Cells:
     """Points of some cells in reduced coordinates."""
 
-    law: LawName  # of the material
+    law: LawName  # law of the material
     B: Array  # grad z = B_q a, (k, d, d, q)
     weight: Array  # xi vol [m^d], (q,)
-    xi: Array  # of its cell, (q,)
-    layer: np.ndarray  # of the material, (q,)
+    xi: Array  # weight of the point's cell, (q,)
+    layer: np.ndarray  # layer of the point's material, (q,)
     cell: np.ndarray  # number of the cell among those of this rank, or of the body once they are gathered, (q,)
-    centre: Array  # of the cell [m], (q, d)
+    centre: Array  # centre of the point's cell [m], (q, d)
 
     @property
     def count(self) -> int:

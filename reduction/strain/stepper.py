@@ -53,7 +53,7 @@ class March:
 
     a: Array  # coordinates, (steps + 1, k)
     v: Array  # rates of the coordinates, (steps + 1, k) [1/s]
-    evaluations: float  # of the force, in the mean of a step
+    evaluations: float  # mean number of evaluations of the force in a step
     restarts: int  # fresh tangents
     engine: str  # "C" or "NumPy"
 

@@ -71,9 +71,9 @@ class StrainErrors:
 class Products:
     """Phi'W Phi (k, k), Phi'W X (k, m) and |X|_W^2 of snapshots X in one product W."""
 
-    gram: Array
-    cross: Array
-    square: float
+    gram: Array  # Phi'W Phi, (k, k)
+    cross: Array  # Phi'W X, (k, m)
+    square: float  # squared norm |X|_W^2
 
     def missed(self, a: Array) -> float:
         """|X - Phi A'|_W^2 of coordinates (m, k), of the leading ones alone where they are fewer."""
@@ -152,7 +152,7 @@ class Training:
     cells: Cells  # all cells of this rank
     offset: int  # number of this rank's first cell
     references: tuple[Reference, ...]  # the runs in terms of the basis
-    seconds: float = 0.0  # of the computation of the basis [s]
+    seconds: float = 0.0  # time of the computation of the basis [s]
     _galerkin: dict[int, tuple[StrainRun, ...]] = field(default_factory=dict)
     _spent: dict[int, dict[str, float]] = field(default_factory=dict)
 

@@ -14,7 +14,7 @@ from softgrasp.lqr import BasisGains, Design, GainQuality, LoopMargins, RiccatiS
 from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, gain_change, settled
 from softgrasp.study.forward.result import trajectory_header
 from softgrasp.study.pictures import speed_up
-from softgrasp.study.report import Columns, Page, Section, Table, captioned, entry, table_of
+from softgrasp.study.report import Columns, Page, Section, Share, Table, captioned, entry, percent, table_of
 from softgrasp.study.report.equation import control_equation
 
 Row = tuple[Any, ...]
@@ -47,14 +47,18 @@ def _mark(gain: GainQuality) -> str:
     return "unstable as sampled" if gain.sampled.value >= 1 else "not certified as sampled"
 
 
-def _value(path: str, factor: float = 1.0) -> Callable[[GainQuality], float | None]:
+def _value(path: str, factor: float = 1.0, kind: type[float] = float) -> Callable[[GainQuality], float | None]:
     """The number of a gain; nothing where there is no gain, or no finite number."""
 
     def cell(gain: GainQuality) -> float | None:
         value = entry(gain, path)
-        return None if gain.reason or value is None or not np.isfinite(value) else float(factor * value)
+        return None if gain.reason or value is None or not np.isfinite(value) else kind(factor * value)
 
     return cell
+
+
+def _share(path: str) -> Callable[[GainQuality], float | None]:
+    return _value(path, kind=Share)
 
 
 def _number(x: float) -> str:
@@ -62,21 +66,21 @@ def _number(x: float) -> str:
 
 
 GAIN: Columns = {
-    "excess cost as it runs": _value("cost_excess"), "proved to the end": _value("cost_excess_proved"),
-    "at most": _value("cost_excess_at_most"), "abscissa [1/s]": _value("abscissa_full"),
+    "excess cost as it runs": _share("cost_excess"), "proved to the end": _share("cost_excess_proved"),
+    "at most": _share("cost_excess_at_most"), "abscissa [1/s]": _value("abscissa_full"),
     "radius a tick": _value("sampled.value"),
 }  # fmt: skip
 REDUCED: Columns = {
-    "basis": lambda r: TITLES[r.method], "N": "N", "error of P": _value("error_P"), "error of K": _value("error_K"),
+    "basis": lambda r: TITLES[r.method], "N": "N", "error of P": _share("error_P"), "error of K": _share("error_K"),
     **GAIN, "reduced ARE [ms]": _value("time_are", 1e3), "gain": _mark,
 }  # fmt: skip
 BOX: Columns = {
     "lambda [Pa]": lambda p: p.materials[0].lam, "mu [Pa]": lambda p: p.materials[0].mu,
-    "error of K": _value("error_K"), **GAIN, "re-tuned in [ms]": _value("seconds", 1e3), "gain": _mark,
+    "error of K": _share("error_K"), **GAIN, "re-tuned in [ms]": _value("seconds", 1e3), "gain": _mark,
 }  # fmt: skip
 BEST: Columns = {
-    "best stable gain": lambda b: TITLES[b["basis"].name], "N": "best.N", "error P": "best.error_P .1e",
-    "error K": "best.error_K .1e", "excess": "best.cost_excess .1e", "at most": "best.cost_excess_at_most .1e",
+    "best stable gain": lambda b: TITLES[b["basis"].name], "N": "best.N", "error P": "best.error_P %",
+    "error K": "best.error_K %", "excess": "best.cost_excess %", "at most": "best.cost_excess_at_most %",
     "abscissa": "best.abscissa_full .4g", "ARE, ms": lambda b: b["best"] and f"{1e3 * b['best'].time_are:.2g}",
     "unstable N": lambda b: ", ".join(str(r.N) for r in b["basis"].reports if r.ruled_out) or b["basis"].refused,
 }  # fmt: skip
@@ -134,7 +138,7 @@ def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[st
 def _settled_gain(solution: RiccatiSolution) -> list[tuple[str, str]]:
     """Of a Galerkin gain the changes between the last two spaces: its residual says little of the gain."""
     change = gain_change(solution)
-    text = change and f"rows of the hand {change['hand']:.1e}, of the tissue {change['tissue']:.1e}"
+    text = change and f"rows of the hand {percent(change['hand'])}, of the tissue {percent(change['tissue'])}"
     return [("last change of the gain", text)] if text else []
 
 
@@ -146,8 +150,9 @@ def summary(study: GainStudy) -> list[str]:
     if change is not None:
         first = solved = (
             f"The Riccati equation is solved by a Galerkin method: its true relative residual is "
-            f"{design.solution.residual:.1e}; between the last two spaces the gain changed by {change['hand']:.1e} in "
-            f"the rows of the hand and by {change['tissue']:.1e} in those of the tissue."
+            f"{design.solution.residual:.1e}; between the last two spaces the gain changed by "
+            f"{percent(change['hand'])} in the rows of the hand and by {percent(change['tissue'])} in those of the "
+            "tissue."
         )
     cost = f"The move costs {optimal:.4g} at least; the abscissa of its loop is {design.quality.abscissa:.3g} 1/s."
     if isinstance(study, ControlStudy):
@@ -199,7 +204,7 @@ def _fast(r: Retuned) -> str:
     )
     return (
         f"{TITLES[r.name]}, N = {r.N}: {len(stable)} of {len(r.points)} stable, at most {1e3 * r.slowest:.2g} ms, "
-        f"excess cost up to {largest:.1e}, at most {bound:.1e}"
+        f"excess cost up to {percent(largest)}, at most {percent(bound)}"
     )
 
 
@@ -223,13 +228,13 @@ def margin_section(margins: LoopMargins, figures: Sequence[tuple[Path, str]]) ->
 def loop_table(study: ControlStudy) -> Table:
     """Full plant under every gain."""
     full = study.loops.full
-    rows: list[Row] = [("optimal", None, float(study.distance(full)[-1]), float(full.cost[-1]), 0.0)]
+    rows: list[Row] = [("optimal", None, float(study.distance(full)[-1]), float(full.cost[-1]), Share(0.0))]
     for r in study.loops.reduced:
         if r.run is None:
             rows.append((f"{TITLES[r.method]}: {r.reason}", r.N, None, None, None))
             continue
         cost, end = float(r.run.cost[-1]), float(study.distance(r.run)[-1])
-        rows.append((TITLES[r.method], r.N, end, cost, cost / float(full.cost[-1]) - 1))
+        rows.append((TITLES[r.method], r.N, end, cost, Share(cost / float(full.cost[-1]) - 1)))
     return Table(LOOP_HEADER, rows, "Closed loop")
 
 

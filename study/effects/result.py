@@ -20,16 +20,22 @@ class Change:
 
 
 @dataclass(frozen=True)
-class JointChange:
-    """One effect switched alone, all others as advised."""
+class Shown:
+    """What brings an effect out that does not show in the scene as it is."""
 
-    change: Change  # of the outputs of the run
-    control: float | None  # of the outputs under a force [1]; None when that is no question
     partners: tuple[str, ...] = ()  # effects beside which it shows, though it does not in the scene as it is
     pair: bool = False  # it shows switched together with its partner, not beside it
     among: tuple[str, ...] = ()  # further effects that had to be switched for that
     together: float = 0.0  # change by it beside the partners, by the pair if it is one [1]
     forced: bool = False  # it shows only when a force moves the hand
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointChange(Shown):
+    """One effect switched alone, all others as advised."""
+
+    change: Change  # of the outputs of the run
+    control: float | None  # of the outputs under a force [1]; None when that is no question
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from softgrasp.fem import EFFECTS, SolverError
 from softgrasp.study.effects.experiments import Names, SwitchRuns
-from softgrasp.study.effects.result import Change, JointChange
+from softgrasp.study.effects.result import Change, JointChange, Shown
 
 Changes = dict[str, tuple[Change, float | None]]  # of the outputs, and under a force
 
@@ -28,16 +28,6 @@ class JointAdvice:
     beside: tuple[str, ...]  # those of them that were on when the company of each was measured
     company: dict[str, JointChange]  # of each effect that was tried
     rivals: dict[str, Rival]  # effects that show, but give way to another
-
-
-class Shown(NamedTuple):
-    """What brings an effect out that does not show in the scene as it is; attributes as of :class:`JointChange`."""
-
-    partners: tuple[str, ...] = ()
-    pair: bool = False
-    among: tuple[str, ...] = ()
-    together: float = 0.0
-    forced: bool = False
 
 
 JointChanges = dict[str, Shown]
@@ -109,9 +99,11 @@ def advised_together(
     shut = [name for name in tried if name not in on and not runs.refusal(on | {name}) and not free(name)]
     joined |= _singles(runs, tried, on, shut, tolerance)
     return on, {
-        name: JointChange(runs.change(on, on ^ {name}), runs.control(on, on ^ {name}), *joined.get(name, Shown()))
-        for name in tried
-        if not runs.refusal(on ^ {name})
+        name: JointChange(
+            **vars(joined.get(name, Shown())), change=runs.change(on, other), control=runs.control(on, other)
+        )
+        for name, other in ((name, on ^ {name}) for name in tried)
+        if not runs.refusal(other)
     }
 
 
@@ -153,11 +145,11 @@ def _pair(
 def finite_strain_beside(runs: SwitchRuns, name: str, alone: tuple[Change, float | None], on: Names) -> JointChange:
     """Finite strain on trial beside all advised effects, one run more; alone where it fails there. Collective."""
     if on == runs.on or runs.refusal(on | {name}):
-        return JointChange(*alone)
+        return JointChange(change=alone[0], control=alone[1])
     try:
         change = runs.change(on, on | {name})
     except SolverError:
-        return JointChange(*alone)
+        return JointChange(change=alone[0], control=alone[1])
     if alone[0].outputs <= runs.scene.study.tolerance < change.outputs:
-        return JointChange(change, alone[1], tuple(sorted(on ^ runs.on)), together=change.outputs)
-    return JointChange(change, alone[1])
+        return JointChange(tuple(sorted(on ^ runs.on)), together=change.outputs, change=change, control=alone[1])
+    return JointChange(change=change, control=alone[1])

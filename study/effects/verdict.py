@@ -52,7 +52,7 @@ def assess(
         advice = _advice(s, verdict, change.outputs, why, cost, tolerance)
         if verdict == "needed" and company is not None and company.change.outputs <= tolerance:
             others = listed([name for name in together.beside if name != s.name])
-            advice += f" Beside {others} it changes them by {company.change.outputs:.1e} only."
+            advice += f" Beside {others} it changes them by {percent(company.change.outputs)} only."
     return EffectResult(s.name, s.on, s.value, gate, verdict, advice, change, control, company, cost, proof)
 
 
@@ -124,7 +124,7 @@ def _switching(names: tuple[str, ...], scene: Scene) -> str:
 
 
 def _change_in_words(change: float) -> str:
-    return "changes nothing" if change == 0 else f"changes the outputs by {change:.1e} only"
+    return "changes nothing" if change == 0 else f"changes the outputs by {percent(change)} only"
 
 
 def _cost_in_words(cost: Cost) -> str:

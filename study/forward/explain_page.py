@@ -111,7 +111,7 @@ def summary(result: Explanation) -> list[str]:
         f"Effects that are on: {listed(on)}; on although they do not matter: {listed(result.idle)}; off although they "
         f"would matter: {listed(result.missing)}.",
         f"Under its weight the tissue sags by {sag.largest:.2g} m; linear elasticity "
-        f"{'holds' if sag.gradient.linear else 'does not hold'} there.",
+        f"{'is valid' if sag.gradient.linear else 'is not valid'} there.",
     ]
 
 
@@ -123,7 +123,7 @@ def sag_rows(result: Explanation) -> list[tuple[str, str]]:
         ("g", "(" + ", ".join(f"{x:g}" for x in sag.g) + f") m/s2{assumed}"),
         ("largest |z|", f"{sag.largest:.4g} m"),
         ("|grad z|", f"{steep.largest:.3g} at most, above {steep.typical:.3g} in {SMALL_SHARE:.0%} of the body"),
-        ("linear elasticity", f"{'holds' if steep.linear else 'does not hold'}: |grad z| is above {SMALL_STRAIN} in "
+        ("linear elasticity", f"{'valid' if steep.linear else 'not valid'}: |grad z| is above {SMALL_STRAIN} in "
          f"{steep.share:.2%} of the body, at most {SMALL_SHARE:.0%} may be"),
     ]  # fmt: skip
 

@@ -90,7 +90,7 @@ def run_simulate(
     def page() -> Page:
         drawn = frames.draw(out, run)
         if session.pictures and mesh_error is not None and mesh_error.by != "coarser":
-            from softgrasp.study.forward.plots import figure_mesh_error  # brings Matplotlib
+            from softgrasp.study.pictures.traces import figure_mesh_error  # brings Matplotlib
 
             drawn += figure_mesh_error(out / "mesh_error.png", run, mesh_error)
         return Page(

@@ -21,6 +21,8 @@ CAPTIONS = {
     "the answer without the error of the mesh, of the time step, of the reduction; no dot: it lies outside.",
     "history.png": "Values after each round over the final ones; a round is a fit with one reduced model.",
 }
+ASSUMED_ERROR = 0.1
+ASSUMED = "Parameters that are not fitted are taken from the scene as exact; their errors come on top."
 
 
 def compose(answer: Identified, session: Session, fitted: Path, options: str) -> Page:
@@ -39,6 +41,7 @@ def compose(answer: Identified, session: Session, fitted: Path, options: str) ->
             terminal=True, figures=figures[1:2],
         ),
         sight_table(answer).section("A deviation above 100 % is no knowledge."),
+        *([assumed_table(answer).section(ASSUMED, terminal=True)] if answer.assumed else []),
         *([nuisance_table(answer).section(terminal=True)] if answer.nuisances else []),
         Section("Fit", rows=fit_rows(answer), figures=figures[2:], terminal=True),
     ]  # fmt: skip
@@ -70,6 +73,13 @@ def sight_table(answer: Identified) -> Table:
         for s, d in zip(answer.sight, answer.directions, strict=True)
     ]
     return Table(("the data see", "with a deviation of"), rows, "What the data see")
+
+
+def assumed_table(answer: Identified) -> Table:
+    """What an error in a parameter that is not fitted does to the values, the largest first."""
+    order = sorted(answer.assumed.items(), key=lambda each: -float(np.abs(each[1]).max()))
+    rows = [(name, *(percent(ASSUMED_ERROR * x, "+") for x in change)) for name, change in order]
+    return Table(("+10 % in", *(f"changes {u.name} by" for u in answer.unknowns)), rows, "What the values rest on")
 
 
 def nuisance_table(answer: Identified) -> Table:
@@ -119,12 +129,17 @@ def error_sentence(answer: Identified) -> str:
 
 
 def summary(answer: Identified) -> list[str]:
-    """What came out, in two sentences."""
+    """What came out, in some sentences."""
     r = answer.residuals
     size = "no larger than the noise" if r.misfit <= r.limit else "larger than the noise"
     white = "white" if r.white >= BY_CHANCE else "not white"
-    next_step = ["fitted.toml is the scene with these values; simulate, reduce and control take it."]
-    return [f"The residuals are {size}, {r.misfit:.3g} sigma, and {white}.", *(next_step if not answer.reasons else [])]
+    sentences = [f"The residuals are {size}, {r.misfit:.3g} sigma, and {white}."]
+    rests = [name for name, x in answer.assumed.items() if (np.abs(ASSUMED_ERROR * x) > answer.total).any()]
+    if rests:
+        sentences.append(f"The values and their errors hold for {listed(rests)} as in the scene.")
+    if not answer.reasons:
+        sentences.append("fitted.toml is the scene with these values; simulate, reduce and control take it.")
+    return sentences
 
 
 def result_of(answer: Identified) -> dict[str, Any]:
@@ -145,6 +160,7 @@ def result_of(answer: Identified) -> dict[str, Any]:
             {"deviation": 1 / max(float(s), 1e-300), "of": dict(zip([u.name for u in answer.unknowns], d, strict=True))}
             for s, d in zip(answer.sight, answer.directions, strict=True)
         ],
+        "assumed": answer.assumed,
         "beside": [{"name": n, "value": v, "deviation": s} for n, v, s in answer.nuisances],
         "residuals": answer.residuals,
         "history": answer.history,

@@ -80,7 +80,8 @@ def _render(shot: body.Shot, frames: Array, times: Array) -> list[Any]:
         # The longest text first, so that all frames have the size of the first.
         stamp = axes[0].set_title(f"t = {times[-1]:.{digits}f} s{note}", pad=3)
         body.colour_bar(figure, axes, shot)
-        body.legend(figure, axes, shot)
+        body.legend(figure, shot)
+        body.settle(figure)
 
         def draw(k: int) -> None:
             body.draw_surroundings(axes[0], shot, [k])

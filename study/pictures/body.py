@@ -5,7 +5,6 @@ Everything comes in as arrays; nothing here computes a simulation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from matplotlib.tri import Triangulation
 
 from softgrasp.fem import Array, PictureMesh
 from softgrasp.study.pictures import shapes, style
+from softgrasp.study.pictures.shapes import Shot
 from softgrasp.study.pictures.style import colour_map, length_unit, paper_style, pressure_unit, save
 
 MANY_CELLS = 300_000  # above, a picture shows the outline only
@@ -30,31 +30,6 @@ ROUNDING = 1e-12  # of the size of the body: what is smaller is no deformation
 CAPTION = 0.72  # width of a caption [inch]
 DOTS: Any = (0, (1, 1.2))
 DASHES: Any = (0, (5, 3))
-
-
-@dataclass(frozen=True)
-class Shot:
-    """What every view of one move shares."""
-
-    picture: PictureMesh  # the body
-    states: Array  # absolute vertex displacements at the instants, shape (k, n, d) [m]
-    times: Array  # instants, shape (k,) [s]
-    hands: Array  # hand coordinates at the instants, shape (k, n_s)
-    tractions: Array | None  # traction of contact on the vertices at the instants, shape (k, n, d) [Pa], if any
-    pressure: float  # largest length of a traction at any instant of the move [Pa]
-    room: Array  # corners of the scene in space without obstacles, (2, d) [m]
-    path: Array  # where the grip of the hand passes, shape (steps, d) [m]
-    norm: Any  # scale of the colours [unit]; from 0 to 0 when nothing deforms
-    unit: tuple[float, str]  # factor and name of the unit of the colours
-    low: Array  # lower corner of the scene in the plane of the picture, (2,) [m]
-    high: Array  # upper corner of the scene in the plane of the picture, (2,) [m]
-    hand: list[Array]  # polygons of the hand where it starts, each (corners, d); empty in 3D
-    edges: Any  # outline and interfaces of layers in 2D, shape (m, 2); empty in 3D
-    aim: list[Array]  # closed lines around the body at the target in the plane of the picture, each (k, 2) [m]
-
-    def values(self, displacement: Array, q_s: Array) -> Array:
-        """|u - R q_s| at the vertices in the unit of the colour bar, shape (n,)."""
-        return np.asarray(self.unit[0] * np.linalg.norm(displacement - self.picture.rigid(q_s), axis=1))
 
 
 def make_shot(
@@ -125,14 +100,15 @@ def figure_move(
         apart = len(states) > 1 and meet
         groups = [[i] for i in range(len(states))] if apart else [list(range(len(states)))]
         figure, axes = make_axes(shot, len(groups), captions=True)
+        for ax, group in zip(axes, groups if apart else (), strict=False):
+            ax.set_title(_time(times[group[0]]), pad=3)
+        colour_bar(figure, axes, shot)
+        legend(figure, shot)
+        settle(figure)
         for ax, group in zip(axes, groups, strict=True):
             draw_surroundings(ax, shot, group)
             draw_scene(ax, shot, states[group], None if apart else times[group], shot.hands[group])
-            if apart:
-                ax.set_title(_time(times[group[0]]), pad=3)
         name_layers(axes[-1], shot, states[-1])
-        colour_bar(figure, axes, shot)
-        legend(figure, axes, shot)
         return save(figure, out_png)
 
 
@@ -164,36 +140,33 @@ def make_axes(
 
     One panel fills a column unless it is flat, several the page; captions get room beside the bodies of one panel or
     above each of several. ``width`` is that of the figure, ``tallest`` the height of all panels together [inch].
+    Matplotlib places the axes, at the latest in :func:`settle`.
     """
     solid, many = shot.picture.dimension == 3, panels > 1
     span = np.maximum(shot.high - shot.low, 1e-3 * float((shot.high - shot.low).max()))
     flat = span[0] > 2.2 * span[1]
     width = width or (style.WIDTH if many or flat else style.COLUMN)
     tallest = tallest or (3.9 if many else 2.8)
-    corner = _free_corner(shot) if solid else ""
-    left, right, bottom = (0.1 if corner else 0.9, 0.72, 0.05) if solid else (0.56, 0.72, 0.42)
-    title = LINE if captions and many else 0.0
+    beside = np.array([0.8, 0.1]) if solid else np.array([1.3, 0.5])  # labels and colour bar
     pads = np.array([[PAD, PAD], [PAD, PAD]])  # [[left, bottom], [right, top]]
     if captions and not many:
         pads += np.array([[0.0, 0.0], [CAPTION, 0.0]]) if _upright(shot) else np.array([[PAD, LINE], [PAD, 0.0]])
 
     def scale_of(shape: tuple[int, int]) -> float:
         """Inches per metre with that many rows and columns."""
-        free = np.array([width - left - right - GAP * (shape[1] - 1), tallest - (GAP + title) * (shape[0] - 1)])
+        free = np.array([width - beside[0] - GAP * (shape[1] - 1), tallest - (GAP + LINE * captions) * (shape[0] - 1)])
         return float(((free / shape[::-1] - pads.sum(axis=0)) / span).min())
 
-    grids = [(r, -(-panels // r)) for r in range(1, panels + 1) if panels % r == 0]
-    rows, columns = max(grids, key=scale_of)
+    rows, columns = max(((r, -(-panels // r)) for r in range(1, panels + 1) if panels % r == 0), key=scale_of)
     scale = scale_of((rows, columns))
     low, high = shot.low - pads[0] / scale, shot.high + pads[1] / scale
     w, h = (high - low) * scale
-    size = (left + columns * w + (columns - 1) * GAP + right, bottom + rows * h + (rows - 1) * (GAP + title) + 0.05)
-    figure, axes = plt.figure(figsize=size), []
-    for i in range(panels):
-        x, y = left + (i % columns) * (w + GAP), bottom + (rows - 1 - i // columns) * (h + GAP + title)
-        ax = figure.add_axes((x / size[0], y / size[1], w / size[0], h / size[1]))
-        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        axes.append(ax)
+    size = beside[0] + columns * (w + GAP), beside[1] + rows * (h + GAP + LINE)
+    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, sharex=True, sharey=True)
+    figure.set_layout_engine("compressed", w_pad=GAP / 4, h_pad=GAP / 2, wspace=0.0, hspace=0.0)
+    axes = list(grid.flat)
+    for ax in axes:
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         ax.plot(*shapes.seen(shot.path).T, ls=DASHES, color=style.OUTLINE, lw=0.9, zorder=1)
         for line in shot.aim:
             ax.plot(*line.T, ls=DOTS, color=style.TARGET, lw=1.3, zorder=5)
@@ -202,33 +175,40 @@ def make_axes(
             continue
         ax.xaxis.set_major_locator(MaxNLocator(int(np.clip(w / 0.5, 2, 6)), steps=style.STEPS))
         ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(h / 0.4, 2, 6)), steps=style.STEPS))
-        ax.tick_params(labelbottom=i // columns == rows - 1, labelleft=i % columns == 0)
-        ax.set_xlabel("x [m]" if i // columns == rows - 1 else "")
-        ax.set_ylabel("y [m]" if i % columns == 0 else "")
+        ax.label_outer()
     if solid:
-        _tripod(figure, size, scale, corner == "top")
+        _tripod(axes[0], shot)
+    else:
+        for ax in grid[-1]:
+            ax.set_xlabel("x [m]")
+        for ax in grid[:, 0]:
+            ax.set_ylabel("y [m]")
     return figure, axes
 
 
+def settle(figure: Any) -> None:
+    """Let Matplotlib place axes, colour bar and legend, once and for all."""
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+
+
 def colour_bar(figure: Any, axes: list[Any], shot: Shot) -> None:
-    """Colour bar of the relative displacement, at most 2.4 inch high; none for outlines and where nothing deforms."""
+    """Colour bar of the relative displacement; none for outlines and where nothing deforms."""
     if len(shot.picture.cells) > MANY_CELLS or not shot.norm.vmax > 0:
         return
-    boxes = [ax.get_position() for ax in axes]
-    inch = 1 / figure.get_figheight()
-    low, high = min(b.y0 for b in boxes), max(b.y1 for b in boxes)
-    middle, height = (low + high) / 2, min(high - low, 2.4 * inch)
-    x, gap = max(b.x1 for b in boxes), 0.1 / figure.get_figwidth()
-    place = figure.add_axes((x + gap, middle - height / 2, gap, height))
-    words = "displacement relative to the hand" if height > 2.2 * inch else "displacement relative\nto the hand"
-    words = words if height > 1.2 * inch else "displacement\nrelative to\nthe hand"
-    label = f"{words} [{shot.unit[1]}]"
-    bar = figure.colorbar(mpl.cm.ScalarMappable(shot.norm, colour_map()), cax=place, label=label)
+    height = 0.8 * figure.get_figheight()  # of the axes, about
+    shrink = min(1.0, 2.4 / height)
+    words = "displacement relative to the hand" if shrink * height > 2.2 else "displacement relative\nto the hand"
+    words = words if height > 1.2 else "displacement\nrelative to\nthe hand"
+    bar = figure.colorbar(
+        mpl.cm.ScalarMappable(shot.norm, colour_map()), ax=axes, label=f"{words} [{shot.unit[1]}]", shrink=shrink,
+        aspect=18 * shrink * height / 2.4, pad=0.02,
+    )  # fmt: skip
     bar.outline.set_linewidth(0.5)
-    bar.ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(height / inch / 0.35, 2, 6)), steps=style.STEPS))
+    bar.ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(shrink * height / 0.35, 2, 6)), steps=style.STEPS))
 
 
-def legend(figure: Any, axes: list[Any], shot: Shot) -> None:
+def legend(figure: Any, shot: Shot) -> None:
     """One row above the axes, where nothing is hidden."""
     entries: list[Any] = []
     filled = len(shot.picture.cells) <= MANY_CELLS
@@ -244,12 +224,7 @@ def legend(figure: Any, axes: list[Any], shot: Shot) -> None:
         entries.append(Line2D([], [], ls="", marker=r"$\rightarrow$", ms=9, color=style.HAND, label=label))
     if shot.aim:
         entries.append(Line2D([], [], ls=DOTS, color=style.TARGET, lw=1.3, label="target"))
-    title = LINE if axes[0].get_title() else 0.0
-    top = max(ax.get_position().y1 for ax in axes) + (0.05 + title) / figure.get_figheight()
-    figure.legend(
-        handles=entries, loc="lower center", bbox_to_anchor=(0.5, top), ncols=4, borderaxespad=0.0, columnspacing=1.2,
-        handlelength=1.8,
-    )  # fmt: skip
+    figure.legend(handles=entries, loc="outside upper center", ncols=4, columnspacing=1.2, handlelength=1.8)
 
 
 def _time(t: float) -> str:
@@ -287,25 +262,23 @@ def _free_corner(shot: Shot) -> str:
     return "top" if way.prod() > 0 else "bottom"
 
 
-def _tripod(figure: Any, size: tuple[float, float], scale: float, top: bool) -> None:
-    """The directions of a 3D scene, each arm of the same length in space, in a left corner."""
-    length = 0.55 / scale  # [m], rounded down to 1, 2 or 5 times a power of ten
+def _tripod(ax: Any, shot: Shot) -> None:
+    """The directions of a 3D scene, each arm of the same length in space, in a free left corner or beside the scene."""
+    length = 0.2 * float((shot.high - shot.low).max())  # [m], rounded down to 1, 2 or 5 times a power of ten
     power = 10.0 ** np.floor(np.log10(length))
     length = power * max(m for m in (1, 2, 5) if m * power <= length * 1.001)
-    ends = shapes.seen(length * np.eye(3))
-    low = np.minimum(ends.min(axis=0), 0.0)
-    extent = np.maximum(ends.max(axis=0), 0.0) - low
-    y = size[1] - 0.25 - scale * extent[1] if top else 0.4
-    ax = figure.add_axes((0.08 / size[0], y / size[1], *(scale * extent / size)))
-    ax.set(xlim=(low[0], low[0] + extent[0]), ylim=(low[1], low[1] + extent[1]))
-    ax.set_axis_off()
+    ends, corner = shapes.seen(length * np.eye(3)), _free_corner(shot)
+    low, high = np.minimum(ends.min(axis=0), 0.0), np.maximum(ends.max(axis=0), 0.0)
+    foot = shot.low - low
+    foot[0] -= 0.0 if corner else high[0] - low[0] + 0.15 * (shot.high - shot.low)[0]
+    foot[1] = shot.high[1] - high[1] if corner == "top" else foot[1] + 0.5 * length
+    look: dict[str, Any] = {"annotation_clip": False, "ha": "center", "va": "center"}
     for name, end in zip("xyz", ends, strict=True):
-        ax.annotate("", end, (0.0, 0.0), arrowprops={"arrowstyle": "-", "lw": 0.8, "shrinkA": 0, "shrinkB": 0})
-        away = 5 * end / np.linalg.norm(end)
-        ax.annotate(name, end, away, textcoords="offset points", ha="center", va="center")
-    ax.annotate(
-        f"{length:g} m each", (0.0, 0.0), (0, -9), xycoords="axes fraction", textcoords="offset points", va="top"
-    )
+        arm = {"arrowstyle": "-", "lw": 0.8, "shrinkA": 0, "shrinkB": 0}
+        ax.annotate("", foot + end, foot, arrowprops=arm, annotation_clip=False)
+        ax.annotate(name, foot + end, 5 * end / np.linalg.norm(end), textcoords="offset points", **look)
+    text = f"{length:g} m each"
+    ax.annotate(text, foot + low, (0, -9), textcoords="offset points", va="top", annotation_clip=False)
 
 
 def name_layers(ax: Any, shot: Shot, u: Array, *, inside: bool = False) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.collections import PolyCollection
@@ -11,10 +11,8 @@ from matplotlib.colors import to_rgb
 
 from softgrasp.fem import Array, Ball, HalfSpace, Obstacle, Polytope, Shape
 from softgrasp.study.pictures import shapes
+from softgrasp.study.pictures.shapes import Shot
 from softgrasp.study.pictures.style import HAND, OUTLINE
-
-if TYPE_CHECKING:
-    from softgrasp.study.pictures.body import Shot
 
 GREY = "#d9d9d9"
 BEHIND, BEFORE = 0.5, 3.5  # zorder of what lies behind a body and before it

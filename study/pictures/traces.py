@@ -1,15 +1,16 @@
-"""Hand and outputs of a move against time."""
+"""Hand and outputs of a move against time, and the error of the mesh."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from softgrasp.fem import AXES, Array, Columns, hand_columns
-from softgrasp.study.pictures.style import COLUMN, CYCLE, HAND, STEPS, length_unit, paper_style
+from softgrasp.fem import AXES, Array, Columns, MeshEstimate, Trajectory, hand_columns
+from softgrasp.study.pictures.style import COLUMN, CYCLE, HAND, STEPS, length_unit, paper_style, save
 
 
 def traces(
@@ -94,3 +95,24 @@ def _angles(ax: Any, times: Array, q_s: Array, d: int) -> None:
             ax.plot(times, q_s[:, d + j], color=CYCLE["xyz".index(column.axis[-1])], label=f"hand, {column.axis}")
     ax.set_ylabel("hand angle [rad]")
     ax.legend(loc="best", handlelength=2.0)
+
+
+def figure_mesh_error(out_png: Path, run: Trajectory, result: MeshEstimate) -> tuple[Path, ...]:
+    """Outputs against the hand, y and y + delta y, with the band of the bound; PNG and PDF."""
+    relative = run.outputs - run.outputs_rigid
+    shown = [i for i in range(relative.shape[1]) if np.abs(relative[:, i]).max() > 0][:6]
+    corrected = relative + result.delta
+    band = result.bound * np.linalg.norm(corrected, axis=1).max()
+    factor, unit = length_unit(float(np.abs(relative).max(initial=0.0)))
+    with paper_style():
+        figure, ax = plt.subplots(figsize=(COLUMN, 2.4), layout="constrained")
+        for k, i in enumerate(shown):
+            color = CYCLE[k % len(CYCLE)]
+            y, name = factor * relative[:, i], run.output_names[i]
+            ax.fill_between(run.times, y - factor * band, y + factor * band, color=color, alpha=0.15, lw=0)
+            ax.plot(run.times, y, color=color, label=f"{name} of this mesh")
+            ax.plot(run.times, factor * corrected[:, i], color=color, ls="--", label=f"{name} corrected")
+        ax.set_xlabel("time [s]")
+        ax.set_ylabel(f"relative to hand [{unit}]")
+        figure.legend(loc="outside upper center", ncols=2)
+        return save(figure, out_png)

@@ -14,6 +14,7 @@ from softgrasp.study.precision.predict import SAFETY, Prediction, Predictor
 from softgrasp.study.precision.reduced import ReducedRuns
 from softgrasp.study.precision.result import Answer, Choice, ReferenceSolution
 from softgrasp.study.precision.settings import Setting
+from softgrasp.study.report import percent
 
 TRIES = 4  # settings that are run to check a prediction
 LUCK = 1.5  # times the tolerance: where more is predicted, errors of mesh and steps only cancel each other
@@ -57,7 +58,7 @@ def advice(shares: dict[str, float]) -> str:
         "time": "more time.steps",
         "reduction": "a larger N, reduction.N",
     }[largest]
-    parts = ", ".join(f"{name} {value:.1e}" for name, value in shares.items())
+    parts = ", ".join(f"{name} {percent(value)}" for name, value in shares.items())
     return f"Of its error, {largest} carries the largest share ({parts}): {better} would help first."
 
 
@@ -159,14 +160,15 @@ class Answers:
         if full is not None:
             words.append(
                 f"The cheapest full run within {tolerance:g} is {full.point.label}: {_prediction(full)}, measured "
-                f"{full.point.error:.1e} of the deformation ({full.point.error_displacement:.1e} of the displacement) "
+                f"{percent(full.point.error)} of the deformation ({percent(full.point.error_displacement)} of the "
+                "displacement) "
                 f"in {seconds_text(full.point.seconds)}."
             )
         if reduced is not None and isinstance(reduced.point, ReducedPoint):
             point = reduced.point
             words.append(
                 f"The fastest model for many runs is {point.label}: {_prediction(reduced)} a run, measured "
-                f"{point.error:.1e} in {seconds_text(point.seconds)}; from nothing, with the full run behind it, "
+                f"{percent(point.error)} in {seconds_text(point.seconds)}; from nothing, with the full run behind it, "
                 f"{seconds_text(point.scratch)}."
             )
         if full is None and reduced is None:
@@ -176,7 +178,7 @@ class Answers:
             words.append("No reduced model that was tried meets it.")
         words.append(
             f"Errors are those of the deformation, the outputs against the hand, over the largest such output. The "
-            f"reference's own error, {self.truth.error:.1e}, is added to every measured one before comparing."
+            f"reference's own error, {percent(self.truth.error)}, is added to every measured one before comparing."
         )
         words += self._against_own_mesh(tolerance)
         return Answer("tolerance", tolerance, tuple(words), full, reduced, closest)
@@ -186,21 +188,21 @@ class Answers:
         every: list[RunPoint] = [*usable(self.forward), *usable(self.reduced), *usable(self.measured)]
         best = min(every, key=lambda p: p.error)
         words = [
-            f"Nothing tried meets {tolerance:g}; closest is {best.label} with the error {best.error:.1e}, give or take "
-            f"{self.truth.error:.1e}, in {seconds_text(best.seconds)}."
+            f"Nothing tried meets {tolerance:g}; closest is {best.label} with an error of {percent(best.error)}, "
+            f"give or take {percent(self.truth.error)}, in {seconds_text(best.seconds)}."
         ]
         words.append(advice(self.shares(best)))
         large = self.too_large(tolerance)
         if self.truth.error >= tolerance:
             part = self.truth.largest_part
             words.append(
-                "The reference itself is not known that well, so that nothing can be shown to meet it: most of its "
+                "The reference itself is not known that well, so that nothing is known to meet it: most of its "
                 f"own error is the {part} part, and would need {self.truth.need}."
             )
         elif large is not None:
             words.append(
                 f"Predicted to meet it, but too large to be tried here: {large.setting.label}, error "
-                f"{large.error:.1e} in {seconds_text(large.seconds)}."
+                f"{percent(large.error)} in {seconds_text(large.seconds)}."
             )
         return self.choice(best), words
 
@@ -231,7 +233,7 @@ class Answers:
         p = min(good, key=lambda p: p.seconds)
         return [
             f"Against the full run on the scene's own mesh alone, whose error is not counted then, {p.label} has the "
-            f"error {p.error_outputs_full:.1e} in {seconds_text(p.seconds)} a run."
+            f"error {percent(p.error_outputs_full)} in {seconds_text(p.seconds)} a run."
         ]
 
     def budget(self, seconds: float) -> Answer:
@@ -280,9 +282,9 @@ def _two_bases(points: Sequence[ReducedPoint], attribute: str) -> list[ReducedPo
 
 def _prediction(choice: Choice) -> str:
     error, seconds = choice.predicted or (0.0, 0.0)
-    return f"predicted error {error:.1e} in {seconds_text(seconds)}"
+    return f"predicted error {percent(error)} in {seconds_text(seconds)}"
 
 
 def _step_words(point: RunPoint) -> str:
     times = ", ".join(f"{name} {seconds_text(getattr(point, name))}" for name in ("p50", "p99", "max"))
-    return f"error {point.error:.1e}, step {times}"
+    return f"error {percent(point.error)}, step {times}"

@@ -54,7 +54,7 @@ def slope(
     expected: float | None = None,
     root: int = 1,
 ) -> list[Slope]:
-    """The slope of one attribute y against another, x^(1 / root), over a line; nothing where they do not tell one."""
+    """The slope of one attribute y against another, x^(1 / root), over a line; nothing where they do not give one."""
     power = power_law([getattr(p, x) ** (1 / root) for p in line], [getattr(p, y) for p in line])
     if power is None:
         return []

@@ -142,7 +142,7 @@ def forward_slopes(
 ) -> list[Slope]:
     """Orders: of the error in n_e^(1/d), of the change in the steps, of time in the unknowns.
 
-    Errors nearer than :data:`CLEAR` times that of the reference tell no order.
+    Errors nearer than :data:`CLEAR` times that of the reference give no order.
     """
     slopes: list[Slope] = []
     d = truth.series.dimension

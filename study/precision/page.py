@@ -138,7 +138,7 @@ def _sections(study: WorkStudy, commands: list[dict[str, str]], figures: dict[st
     ]
     truth = study.truth
     if truth is not None:
-        rows = [(f"error estimate, {name}", f"{a:.1e} of the deformation, {b:.1e} of the displacement")
+        rows = [(f"error estimate, {name}", f"{percent(a)} of the deformation, {percent(b)} of the displacement")
                 for name, (a, b) in truth.parts.items()]  # fmt: skip
         rows.append(("runs behind it", "; ".join(s.label for s in truth.settings)))
         sections.append(Section("Reference", text=truth.note, rows=rows, terminal=True))

@@ -41,7 +41,7 @@ LINE: dict[str, Any] = {"color": "#D00000", "lw": 0.9, "ls": (0, (4, 3)), "zorde
 SOLVERS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 4, "color": HAND}
 CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 5, "mew": 1.1, "color": UNSTABLE}
 EDGE: dict[str, Any] = {"clip_on": False, "in_layout": False}
-NEAR = 1e-2  # of the lowest point: a reference that is better still is not drawn, the text tells its error
+NEAR = 1e-2  # of the lowest point: a reference that is better still is not drawn, the text reports its error
 TOP, LOW = 1.0, 1e-13  # errors and excess costs of gains above are on the edge, below are rounding
 DEFORMATION = "relative error of the deformation"
 

@@ -47,7 +47,7 @@ class Predictor:
         for p in runs:
             self.learn(p)
         changing = over_steps(runs)
-        # the mesh with the most steps tried tells about time, the most accurate of those
+        # the mesh with the most steps tried gives the error in time, the most accurate of those
         best = {name: -self.space[line[0].setting.group].error for name, line in changing.items()}
         name = max(changing, key=lambda name: (len(changing[name]), best[name]), default="")
         most = max((p.steps for p in runs if p.series == name), default=1)
@@ -157,7 +157,7 @@ def error_budget(
 
 
 def _halved[P: WorkPoint](name: str, point: P | None, others: Sequence[P], error: Callable[[P], float]) -> list[Source]:
-    """A part that a point of a question tells, with the fastest one of half its error."""
+    """A part that a point of a question gives, with the fastest one of half its error."""
     if point is None or not isfinite(error(point)):
         return []
     better = min((p for p in usable(others) if error(p) <= error(point) / 2), key=lambda p: p.seconds, default=None)

@@ -22,6 +22,7 @@ from softgrasp.fem import Scene, SceneError
 from softgrasp.study.precision.full import FullRuns, Series, TimedRun, largest, relative
 from softgrasp.study.precision.result import ReferenceSolution
 from softgrasp.study.precision.settings import Setting, contraction, edges, few_steps, fits
+from softgrasp.study.report import percent
 
 ORDER = 3  # of the elements
 LADDER = tuple(round(a * 10.0**-k, 12) for k in range(1, 7) for a in (3.0, 1.0))  # tolerances of the meshes
@@ -31,7 +32,7 @@ WORK = {2: 1e7, 3: 6e6}  # unknowns times steps of the finest run: some seconds 
 LARGEST = {2: 60_000, 3: 60_000}  # unknowns
 TIME_WORK = {2: 8e6, 3: 2e6}  # unknowns times steps of the run behind the time part
 GROWTH = 1.6  # of unknowns from mesh to mesh, expected at least
-LEAST = 1.4  # and below this a mesh tells no more than the one before
+LEAST = 1.4  # and below this a mesh brings no more than the one before
 ROUGH = 0.05  # error of a reference that is worth a warning
 STILL = 1e-12  # of the displacement: an output that moves less against the hand moves with it
 
@@ -80,8 +81,8 @@ def combine(
     scale = largest(total, d)
     if not scale[0] > STILL * max(scale[1], 1e-300):
         raise SceneError(
-            "control.outputs: no output moves against the hand, so that there is no deformation whose error could be "
-            "told; name a point of the tissue, in a scene that moves"
+            "control.outputs: no output moves against the hand, so that no error of a deformation can be "
+            "measured; name a point of the tissue, in a scene that moves"
         )
 
     changes = [relative(b - a, scale, d) for a, b in pairwise(values)] or [(1.0, 1.0)]
@@ -106,8 +107,8 @@ def _note(
     setting, run = meshes[-1]
     words = (
         f"Reference: {len(meshes)} graded meshes down to {setting.mesh} with {run.n_e} unknowns; in time {steps} steps "
-        f"on {middle.mesh}. Its own relative error of the deformation is estimated as {truth.error:.1e} (displacement "
-        f"{truth.error_displacement:.1e}); the measured errors may be wrong by as much either way."
+        f"on {middle.mesh}. Its own relative error of the deformation is estimated as {percent(truth.error)} "
+        f"(displacement {percent(truth.error_displacement)}); the measured errors may be wrong by as much either way."
     )
     if truth.error > ROUGH:
         words += f" That is too much to judge by: most of it is the {truth.largest_part} part, and would need "

@@ -40,7 +40,7 @@ TIGHT = (1e-12, 1e-11, 1e-10, 1e-8)  # of the two references, the first that rou
 DENSE_MOST = 1000  # states; beyond, one dense solution takes longer than all others together
 REPEAT_SECONDS = 1.0  # a solver is repeated while it has taken less
 LARGE = {2: 15_000, 3: 3_000}  # tissue unknowns beyond which the questions of control are asked by name only
-CLOSE = 10.0  # times the error of the reference; gains nearer to it tell no slope
+CLOSE = 10.0  # times the error of the reference; gains nearer to it give no slope
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class ControlRuns:
 
     @cached_property
     def reference(self) -> GainReference:
-        """The tightest solutions of Newton-ADI and RADI; others stand in for one that fails.
+        """The tightest solutions of Newton-ADI and RADI; others replace one that fails.
 
         Raises:
             SolverError: no method reaches any of :data:`TIGHT`.
@@ -211,7 +211,7 @@ def _measure(runs: ControlRuns, method: Method, tol: float, label: str) -> list[
 
 
 def above(error: float | None) -> float:
-    """Errors from which on a reference with this error tells a slope."""
+    """Errors from which on a reference with this error gives a slope."""
     return CLOSE * error if error is not None and np.isfinite(error) else 0.0
 
 

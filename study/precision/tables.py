@@ -29,7 +29,7 @@ from softgrasp.study.precision.result import (
     WorkStudy,
 )
 from softgrasp.study.precision.riccati import TITLES as METHOD_TITLES
-from softgrasp.study.report import Table
+from softgrasp.study.report import Share, Table, percent
 
 SERIES_TITLES: dict[str, dict[str, str]] = {
     "reduced": {key: method.title for key, method in METHODS.items()},
@@ -47,21 +47,25 @@ def _title(p: WorkPoint | Slope) -> str:
     return SERIES_TITLES.get(p.question, {}).get(p.series, p.series)
 
 
-def _error(point: RunPoint) -> float | str:
+def _error(point: RunPoint) -> Share | str:
     """The error, or below what it is where that of the reference is the larger one."""
     low, high = point.error_range
-    return f"< {high:.2g}" if low == 0 and np.isfinite(high) else point.error
+    return f"< {percent(high)}" if low == 0 and np.isfinite(high) else Share(point.error)
+
+
+def _share(name: str) -> Callable[[Any], Share]:
+    return lambda p: Share(getattr(p, name))
 
 
 # Of every question: the columns with the attribute, or the function, that gives their cells.
 COLUMNS: dict[str, dict[str, str | Callable[[Any], Any]]] = {
     "forward": {
-        "setting": "label", "unknowns": "n_e", "deform. error": _error, "displ. error": "error_displacement",
+        "setting": "label", "unknowns": "n_e", "deform. error": _error, "displ. error": _share("error_displacement"),
         "assembly [s]": "assembly", "factor [s]": "factor", "step [us]": lambda p: 1e6 * p.per_step,
         "run [s]": "seconds",
     },
     "reduced": {
-        "setting": _title, "N": "N", "deform. error": "error_outputs_full", "state error": "error_full",
+        "setting": _title, "N": "N", "deform. error": _share("error_outputs_full"), "state error": _share("error_full"),
         "deform. error with the mesh": _error, "online [s]": "seconds", "from nothing [s]": "scratch",
     },
     "bases": {
@@ -69,11 +73,12 @@ COLUMNS: dict[str, dict[str, str | Callable[[Any], Any]]] = {
         "|U'U - I|": "orthonormality", "time [s]": "seconds",
     },
     "riccati": {
-        "method": _title, "tolerance": lambda p: None if p.series == "dense" else p.tolerance, "gain error": "error",
-        "residual": "residual", "rank": "rank", "solves": "solves", "time [s]": "seconds",
+        "method": _title, "tolerance": lambda p: None if p.series == "dense" else p.tolerance,
+        "gain error": _share("error"), "residual": "residual", "rank": "rank", "solves": "solves",
+        "time [s]": "seconds",
     },
     "reduced_riccati": {
-        "basis": _title, "N": "N", "gain error": "error", "excess cost": "cost_excess",
+        "basis": _title, "N": "N", "gain error": _share("error"), "excess cost": _share("cost_excess"),
         "abscissa [1/s]": "abscissa_full", "equation [ms]": lambda p: 1e3 * p.seconds, "from nothing [s]": "scratch",
     },
 }  # fmt: skip
@@ -108,7 +113,7 @@ def _why(p: WorkPoint) -> str:
 def budget_table(budget: ErrorBudget) -> Table:
     """Every part with its share, what halves it at which cost, and its digits below a tenth of the largest part."""
     rows: list[tuple[Any, ...]] = [
-        (p.name, p.error, f"{100 * p.share:.2g} %" if p.share > 1e-3 else "< 0.1 %", p.halved_by or "-",
+        (p.name, percent(p.error), percent(p.share) if p.share > 1e-3 else "< 0.1 %", p.halved_by or "-",
          "-" if p.cost is None else f"{p.cost:.2g} x", p.wasted or "-")
         for p in budget.parts
     ]  # fmt: skip
@@ -179,13 +184,13 @@ def reference_text(question: Question, paper: bool) -> str:
         case RiccatiReference() as r:
             apart = "no second method converged, so that its own error is not known"
             if r.error is not None:
-                apart = f"their gains differ by {r.error:.1e}, which is the estimated error of both"
+                apart = f"their gains differ by {percent(r.error)}, which is the estimated error of both"
             text = f"Reference: {' and '.join(r.names)}; {apart}. No method is compared with itself."
             return text + (f" The paper: {PAPER_ARE} s, 2n = 880, on its own machine." if paper else "")
         case ReducedReference() as r:
             text = f"Reference: the gain by {r.method}, with the residual {r.residual:.1e}"
             if r.error is not None:
-                text += f"; the tightest solution of another method differs by {r.error:.1e}"
+                text += f"; the tightest solution of another method differs by {percent(r.error)}"
             text += f". The optimal cost from the scene's start is {r.optimal:.6g}."
             theirs = f" The paper: {1e3 * PAPER_SMALL:.0f} ms at N = {PAPER_N} with the POD of P, on its own machine."
             return text + (theirs if paper else "")

@@ -79,7 +79,7 @@ def error_table(c: Certificate) -> Table:
 
 
 def output_table(answer: CertifiedAnswer) -> Table:
-    """Every output at the end, its largest deformation, and how far both can be off."""
+    """Every output at the end, its largest deformation, and the errors of both."""
     bound = f"error {answer.certificate.how} [m]"
     header = ("output", "at the end [m]", "largest deformation [m]", bound, "error estimated [m]")
     return Table(header, answer.outputs(), "Outputs")
@@ -102,7 +102,7 @@ def _summary(answer: CertifiedAnswer, seconds: float) -> list[str]:
 def _summary_batch(answers: QueryResult) -> list[str]:
     refused, full, outside = answers.counts
     worst = answers.each[answers.worst[0]]
-    where = f"Outside the box of the training: {outside}; the bound holds there too."
+    where = f"Outside the box of the training: {outside}; the bound is valid there too."
     return [
         f"The largest error of the reduction {worst.certificate.claim(percent(worst.certificate.reduction))}, "
         f"at {worst.parameters}.",

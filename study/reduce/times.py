@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from softgrasp.fem import Model, RunOptions, Stopwatch, Trajectory, simulate
 from softgrasp.reduction import FullRun, full_run
-from softgrasp.study.report import percent
+from softgrasp.study.report import Columns, percent
 from softgrasp.study.shell import RepeatableRun, processor_seconds
 
 FULL_REPEATS = 3  # behind the median of the full run
@@ -147,3 +148,19 @@ def steps_seconds(run: Trajectory) -> float:
     """Seconds of all steps; the first is not among those measured, since it sets up the solver."""
     n = len(run.times) - 1
     return run.seconds["steps"] / max(n - 1, 1) * n
+
+
+def timed(p: Timed, full: FullTimes, **more: Any) -> dict[str, Any]:
+    """A row below :data:`TIMES`: a reduced model with the times ``p`` beside the full model."""
+    return {"p": p, "up": full.against(p), **more}
+
+
+TIMES: Columns = {
+    "run [ms]": lambda r: f"{1e3 * r['p'].time_online:.2f}",
+    "new [ms]": lambda r: f"{1e3 * (r['p'].time_setup + r['p'].time_online):.2f}",
+    "offline [s]": "p.time_offline .2f",
+    "x again": "up.again .3g",
+    "x new": "up.new .3g",
+    "break-even": lambda r: "never" if (runs := r["up"].break_even_runs) is None else str(math.ceil(runs)),
+}
+"""Time of a run, of set-up and run at a new parameter, and offline; speed-ups; runs until offline has paid."""

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
         Columns,
         Page,
         Section,
+        Share,
         Table,
         captioned,
         entry,

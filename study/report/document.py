@@ -16,12 +16,17 @@ from rich.console import Console
 from rich.markup import escape
 
 from softgrasp.fem import counted, note
+from softgrasp.fem.shown import percent
 from softgrasp.study.report.equation import Equation
 
 Columns = Mapping[str, str | Callable[[Any], Any]]
 """Of each heading, what a row has there: a path of attributes, or a function of the row."""
 NUMBERS = (int, float, np.integer, np.floating)
 SHOWN, MOST_ROWS = 8, 14  # rows of a longer table that stand unfolded
+
+
+class Share(float):
+    """A number that page and terminal show as a percentage, and a CSV file in full."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +135,8 @@ def cell_text(cell: Any) -> str:
         return ""
     if isinstance(cell, bool | np.bool_):
         return "yes" if cell else "no"
+    if isinstance(cell, Share):
+        return percent(cell)
     return f"{cell:.4g}" if isinstance(cell, float | np.floating) else str(cell)
 
 
@@ -150,7 +157,7 @@ def entry(row: Any, path: str) -> Any:
 def table_of(rows: Sequence[Any], columns: Columns, title: str = "") -> Table:
     """One line a row: for each heading a function of the row, or the entry at a path, formatted ``drift .0e``.
 
-    The format 3 is that of :func:`number`, % that of :func:`percent`; without one the entry stands as it is.
+    The format 3 is that of :func:`number`, % a :class:`Share`; without one the entry stands as it is.
     """
 
     def cell(row: Any, column: str | Callable[[Any], Any]) -> Any:
@@ -160,7 +167,9 @@ def table_of(rows: Sequence[Any], columns: Columns, title: str = "") -> Table:
         value = entry(row, path)
         if not form or value is None:
             return value if not form else number(None)
-        return {"3": number, "%": percent}[form](value) if form in ("3", "%") else f"{value:{form}}"
+        if form == "%":
+            return Share(value)
+        return number(value) if form == "3" else f"{value:{form}}"
 
     return Table(tuple(columns), [[cell(row, column) for column in columns.values()] for row in rows], title)
 
@@ -214,10 +223,3 @@ def numeric(cell: Any) -> bool:
     if cell is None or cell in ("", "-") or (isinstance(cell, NUMBERS) and not isinstance(cell, bool)):
         return True
     return re.fullmatch(r"[<>~]? ?[-+]?[\d.]+(e[-+]?\d+)?( ?%| [a-zA-Zµ/]{1,4})?( ?!)?", str(cell)) is not None
-
-
-def percent(share: float) -> str:
-    """A share as a percentage of two digits; "> 9999 %" also where it is not finite."""
-    if not share < 100:
-        return "> 9999 %"
-    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"

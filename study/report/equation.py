@@ -133,7 +133,7 @@ def equation(scene: Scene) -> Equation:
     else:
         rows.append(("hand", ("$q_s$",), (_motion(scene),)))
         if two_way:
-            rows.append(("force it takes", ("$u$",), (*forces, *(f"$- {w[1:]}" for w in weight))))
+            rows.append(("required force", ("$u$",), (*forces, *(f"$- {w[1:]}" for w in weight))))
     return Equation(blocks, tuple(rows), _definitions(scene, dragged, free))
 
 
@@ -186,7 +186,7 @@ def _definitions(scene: Scene, dragged: bool, free: bool) -> tuple[str, ...]:
         result.append(f"$u(t)$: {drive[scene.motion.profile]}")
     else:
         kept = ", which simulate writes to trajectory.csv" if effects.reaction else ""
-        result.append(f"the motion is prescribed: the hand's row only tells the force $u${kept}")
+        result.append(f"the motion is prescribed: the hand's row gives the force $u$ that the motion requires{kept}")
     return tuple(result)
 
 

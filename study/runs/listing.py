@@ -21,6 +21,19 @@ from softgrasp.study.shell import Session, folder_lock, read_result
 
 ALIKE = 1e-12  # relative difference below which two numbers count as equal: rounding
 LONGEST = 6  # entries of a list that is compared entry by entry
+LIST_WIDTH = 200  # [letters]
+FOREIGN = 5  # files that a list of runs leaves out by name
+
+
+def show_runs(folder: Path, console: Console) -> None:
+    """Print the runs below a folder, and which files are none. Not collective."""
+    console.width = max(console.width, LIST_WIDTH)  # a narrower terminal breaks the lines, but loses nothing
+    runs, foreign = runs_below(folder)
+    console.print(runs.terminal())
+    for file in foreign[:FOREIGN]:
+        console.print(f"left out: {file} is damaged or not of softgrasp", soft_wrap=True, markup=False)
+    if len(foreign) > FOREIGN:
+        console.print(f"and {len(foreign) - FOREIGN} more")
 
 
 def runs_below(folder: Path) -> tuple[Table, list[Path]]:

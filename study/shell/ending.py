@@ -101,7 +101,7 @@ def run_command(command: Callable[[], object]) -> None:
         end_all()
         sys.exit(1)
     except BaseException as error:
-        if reason := no_compiler(error):  # DOLFINx tells it to all ranks
+        if reason := no_compiler(error):  # DOLFINx raises it on all ranks
             sys.stderr.write(f"error: {reason}\n" * (rank() == 0))
             sys.exit(1)
         traceback.print_exc()

@@ -25,7 +25,7 @@ from softgrasp.study.shell.folder import claim, files_of, read_result, remove_fi
 
 
 class Flags(TypedDict, total=False):
-    """What every command may be told beside its own options, see :class:`Session`."""
+    """Options of every command beside its own, see :class:`Session`."""
 
     quiet: bool
     pictures: bool

@@ -12,11 +12,11 @@ from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.study.shell import Session, folder_lock
-from tests.hardcases import certified, contact, estimates, faults, loops, motion, reduction, riccati, statics
+from tests.hardcases import certified, contact, estimates, faults, loops, motion, plans, reduction, riccati, statics
 from tests.hardcases.cases import Family, FamilyResult, HardCaseResult
 from tests.hardcases.page import compose, show
 
-MODULES: Any = (statics, estimates, motion, contact, reduction, certified, riccati, loops, faults)
+MODULES: Any = (statics, estimates, motion, contact, reduction, certified, riccati, loops, plans, faults)
 FAMILIES: dict[str, Family] = {family.name: family for module in MODULES for family in module.FAMILIES}
 
 

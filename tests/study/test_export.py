@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -49,3 +51,13 @@ def test_finite_strain_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=r"strain\.h5: only linear reduced models are exported"):
         export(file, "--c", tmp_path / "plant")
     assert not (tmp_path / "plant").exists()
+
+
+def test_nothing_of_it_is_loaded_unless_it_is_used() -> None:
+    """Models, gains and the commands need neither the writers nor a simulator."""
+    code = (
+        "import sys, softgrasp as sg; import softgrasp.study.cli; sg.reduce, sg.save, sg.design, sg.Controller; "
+        "print([name for name in sys.modules if name.endswith(('reduction.export', 'lqr.export')) or name == 'fmpy'])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

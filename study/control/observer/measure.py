@@ -17,7 +17,7 @@ TICKS = 100  # tens of ticks behind the time of one
 
 
 def observed_study(design: Design, watch: Stopwatch) -> ObservedStudy:
-    """Observer, judgement and time of a tick. Collective. Raises ControlError, SolverError: see :func:`observe`."""
+    """Observer, judgement and time of a tick. Collective. Raises ControlError: see :func:`observe`."""
     found, comm = observe(design, watch), design.problem.layout.comm
     tick = comm.bcast(_tick_seconds(found.controller))
     return ObservedStudy(found, tick, _nodes(design, found), design.problem.names)

@@ -67,4 +67,6 @@ def facts(study: ObservedStudy) -> Iterator[tuple[str, str]]:
             (f"rank {solution.rank}, {solution.counts['solves']} solves, true residual {solution.residual:.1e}"),
         )
         yield "its deviation at a node", f"{low:.2g} to {high:.2g} m, median {middle:.2g} m"
+    if found.missing:
+        yield "full Kalman filter", f"none: {found.missing}"
     yield "time of a tick", f"{1e6 * study.tick:.2g} us in Python"

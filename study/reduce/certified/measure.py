@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from statistics import median
@@ -11,7 +11,6 @@ import numpy as np
 
 from softgrasp.fem import Model, Stopwatch
 from softgrasp.reduction import CertifiedModel, TestError, measured_error, run_at
-from softgrasp.study.reduce.certified.result import BoxCheck, Size
 from softgrasp.study.shell import median_seconds
 
 REPEATS = 7  # behind the median time of a query
@@ -19,6 +18,30 @@ TESTS, FEWER, LARGE = 5, 3, 20_000  # tests of each constant, and from so many u
 SHARES = (1 / 12, 1 / 8, 1 / 6, 1 / 4, 1 / 3, 1 / 2)  # of the modes: sizes that are shown
 SECOND = 3  # times as many modes in the basis that certifies, as far as there are
 NEAR = 0.2  # of the model's own k: sizes that would hide it
+
+
+@dataclass(frozen=True)
+class Size:
+    """A certified model of k modes at all tests."""
+
+    k: int  # modes of the answer
+    k2: int  # modes of the basis that certifies it
+    N: int  # dimension of the answer
+    query: float  # median seconds of an answer with its certificate
+    tested: tuple[TestError, ...]  # one a parameter
+
+    def largest(self, key: str) -> float:
+        """Over the tests."""
+        return max(float(getattr(t, key)) for t in self.tested)
+
+
+@dataclass(frozen=True)
+class BoxCheck:
+    """A certified model and smaller ones of its basis over the box."""
+
+    own: Size  # the model as it was built
+    sizes: tuple[Size, ...]  # in the order of k, ``own`` among them
+    full: float  # median seconds of a full run with its factor
 
 
 def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:

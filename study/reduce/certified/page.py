@@ -10,7 +10,7 @@ import numpy as np
 
 from softgrasp.reduction import NORMS, CertifiedModel, Validation
 from softgrasp.reduction.certified.greedy import REASONS
-from softgrasp.study.reduce.certified.result import BoxCheck
+from softgrasp.study.reduce.certified.measure import BoxCheck
 from softgrasp.study.report import Columns, Page, Section, Table, captioned, percent, table_of
 
 CAPTIONS = {

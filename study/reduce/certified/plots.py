@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from softgrasp.reduction import CertifiedModel
 from softgrasp.study.pictures import BLUE, COLUMN, GREEN, HAND, ORANGE, UNSTABLE, few_ticks, paper_style, save
-from softgrasp.study.reduce.certified.result import BoxCheck, Size
+from softgrasp.study.reduce.certified.measure import BoxCheck, Size
 from softgrasp.study.report import percent
 
 KINDS = (

@@ -23,9 +23,8 @@ from softgrasp.reduction.certified.trainer import (
     train_key,
     validate,
 )
-from softgrasp.study.reduce.certified.measure import REPEATS, check_box
+from softgrasp.study.reduce.certified.measure import REPEATS, BoxCheck, check_box
 from softgrasp.study.reduce.certified.page import compose, shown
-from softgrasp.study.reduce.certified.result import BoxCheck
 from softgrasp.study.reduce.result import reduce_result
 from softgrasp.study.report import Page
 from softgrasp.study.shell import Session, median_seconds

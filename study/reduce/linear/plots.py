@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from softgrasp.reduction import PAPER_METHODS
 from softgrasp.study.pictures import film, gif_bytes, hands_at, style, timing, write_gif
-from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, outline
+from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, outline, settle
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, by_error, unbeaten
 from softgrasp.study.reduce.linear.views import Views
 
@@ -218,9 +218,11 @@ def figure_modes(views: Views, out_png: Path) -> tuple[Path, ...]:
     shot = replace(shot, path=shot.path[:1])
     with style.paper_style():
         figure, axes = make_axes(shot, len(shapes), captions=True, width=style.WIDTH, tallest=5.0)
-        for ax, shape, title, hand in zip(axes, shapes, titles, shot.hands, strict=True):
-            draw_scene(ax, shot, shape[None], None, hand[None])
+        for ax, title in zip(axes, titles, strict=True):
             ax.set_title(title, pad=3, fontsize=6.5)
+        settle(figure)
+        for ax, shape, hand in zip(axes, shapes, shot.hands, strict=True):
+            draw_scene(ax, shot, shape[None], None, hand[None])
         return style.save(figure, out_png)
 
 
@@ -235,9 +237,9 @@ def _figure(views: Views, note: str = "") -> tuple[Any, list[Any], Shot]:
         Patch(color=style.HAND, label="hand"),
         Line2D([], [], label="outline of the full model", **OUTLINE),
     ]
-    top = max(ax.get_position().y1 for ax in axes) + 0.36 / figure.get_figheight()
-    figure.legend(handles=entries, loc="lower center", bbox_to_anchor=(0.5, top), ncols=2, borderaxespad=0.0)
+    figure.legend(handles=entries, loc="outside upper center", ncols=2)
     colour_bar(figure, axes, shot)
+    settle(figure)
     return figure, axes, shot
 
 

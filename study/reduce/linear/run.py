@@ -12,8 +12,7 @@ from softgrasp.reduction import FullRun
 from softgrasp.reduction.archive import save
 from softgrasp.study.pictures import draw_in_background
 from softgrasp.study.reduce.linear import measure
-from softgrasp.study.reduce.linear.findings import findings
-from softgrasp.study.reduce.linear.page import compose
+from softgrasp.study.reduce.linear.page import compose, findings
 from softgrasp.study.reduce.linear.result import MethodSweep, ReductionStudy, best
 from softgrasp.study.reduce.linear.views import gather_views
 from softgrasp.study.reduce.times import FullTimes, measured_run

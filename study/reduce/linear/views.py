@@ -10,6 +10,7 @@ import numpy as np
 from softgrasp.fem import Array, Model, PictureMesh, gather_picture, vertex_displacement
 from softgrasp.reduction import PAPER_METHODS, FullRun, ReducedModel, replay_linear, thinned
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, by_error, nearest
+from softgrasp.study.report import percent
 
 MODES = 4  # a method
 FRAMES = 30
@@ -68,7 +69,9 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> V
         states = vertex_displacement(model, np.nan_to_num(z), motion.q_s[steps].T)
         if states is not None:
             state = "" if point.stable else ", unstable"
-            title = f"{s.method.title}, N = {point.N}{state}\ndeformation error {point.error_deformation:.1e}"
+            title = (
+                f"{s.method.title}, N = {point.N}{state}\nerror of the deformation {percent(point.error_deformation)}"
+            )
             views.append(View(title, states))
     modes = [(s.method.title, _modes(model, s.models[p.N]), s.method.frame == "absolute") for s, p in modes_of(sweeps)]
     if picture is None or full is None:

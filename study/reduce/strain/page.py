@@ -17,7 +17,7 @@ from softgrasp.study.reduce.strain.result import (
     StrainStudy,
     most_accurate,
 )
-from softgrasp.study.reduce.tables import TIMES, timed
+from softgrasp.study.reduce.times import TIMES, timed
 from softgrasp.study.report import Columns, Page, Section, Table, captioned, percent, table_of
 
 CAPTIONS = {

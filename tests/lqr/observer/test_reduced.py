@@ -159,6 +159,13 @@ def test_what_step_cannot_take_is_refused() -> None:
         replace(found, observer=replace(found.observer, A=np.eye(14), B=np.zeros((14, 3))))
 
 
+def test_observer_does_without_the_full_filter_where_rounding_ends_it() -> None:
+    found = observed("control.observer.noise.marker=1e-6")[1]
+    assert found.full is None
+    assert "rounding limits this problem" in found.missing
+    assert found.judged.stable
+
+
 @pytest.mark.parametrize(
     ("override", "sentence"),
     [

@@ -130,6 +130,16 @@ def test_a_measured_hand_takes_the_place_of_the_scene_s() -> None:
         sg.identify(other, data(1e-3, hand=(hand[0], hand[1] * np.nan)), "mu", 1e-3)
 
 
+def test_what_is_not_fitted_moves_the_values_as_the_answer_says() -> None:
+    keys = [*GRADED, "time.steps=1200"]
+    found = sg.identify(model(*keys), data(1e-3), "mu,beta", 1e-3)
+    assert set(found.assumed) == {"lambda", "rho"}
+    other = sg.identify(model(*keys, "tissue.material.lambda=51"), data(1e-3), "mu,beta", 1e-3)
+    expected = np.log(51 / 50) * found.assumed["lambda"]
+    # 1 % of it is the curvature of 2 % in lambda, the rest another basis: a tenth of the noise
+    assert np.abs(np.log(other.values / found.values) - expected).max() < 0.01 * np.abs(expected).max() + 4e-4
+
+
 def test_more_experiments_tell_more() -> None:
     one = sg.identify(model(*GRADED, "time.steps=1200"), data(1e-3), "mu,beta", 1e-3)
     two = sg.identify(model(*GRADED, "time.steps=1200"), [data(1e-3), data(1e-3, 1)], "mu,beta", 1e-3)

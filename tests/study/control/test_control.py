@@ -20,6 +20,7 @@ from softgrasp.fem.errors import SceneError, SoftgraspError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene
+from softgrasp.fem.shown import percent
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.design.scene import actuation, with_control
 from softgrasp.lqr.loop.controller import Controller, load_gain
@@ -92,8 +93,8 @@ def test_page_and_terminal_have_the_same_tables(result: dict[str, Any], out: Pat
         assert heading in page
     for point in best:
         for key in ("error_K", "cost_excess_at_most"):
-            assert f"{point[key]:.1e}" in text
-            assert f"{point[key]:.1e}" in page
+            assert percent(point[key]) in text
+            assert percent(point[key]) in page
 
 
 @pytest.mark.serial
@@ -365,10 +366,10 @@ def test_galerkin_states_its_true_residual_and_the_part_of_the_tissue(tmp_path: 
     assert found["residual"] > 1e-4  # a long way from the tolerance of a low-rank method, and said so
     assert 0 < hand < 1e-2 * tissue < 1e-5
     assert f"{found['residual']:.1e}" in text.getvalue()
-    assert f"rows of the hand {hand:.1e}, of the tissue {tissue:.1e}" in text.getvalue()
+    assert f"rows of the hand {percent(hand)}, of the tissue {percent(tissue)}" in text.getvalue()
     page = (out / "report.html").read_text()
     assert f"{found['residual']:.1e}" in page
-    assert f"{tissue:.1e}" in page
+    assert percent(tissue) in page
 
 
 def test_galerkin_with_all_modes_is_exact(tmp_path: Path) -> None:

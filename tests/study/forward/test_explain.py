@@ -98,7 +98,7 @@ def test_force_and_two_way() -> None:
         "M_hand q_s''", "M_r (q_s'' - g)", "G' z''", "alpha M_r q_s'", "alpha G' z'",
     )  # fmt: skip
     held = stepped(scene_of(effects={"reaction": True}))
-    assert held["force it takes"][0] == ("u",), "a prescribed motion leaves the force to be told"
+    assert held["required force"][0] == ("u",), "a prescribed motion leaves the force to be found"
 
 
 def test_paper_sizes(comm: MPI.Intracomm) -> None:

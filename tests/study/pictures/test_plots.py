@@ -5,6 +5,7 @@ from __future__ import annotations
 import softgrasp.fem  # noqa: F401
 
 # isort: split
+import re
 from contextvars import ContextVar
 from html.parser import HTMLParser
 from pathlib import Path
@@ -319,3 +320,11 @@ def test_figures_are_cut_like_matplotlibs_own_tight_ones(tmp_path: Path) -> None
         ink = ImageChops.invert(image).getbbox()
         assert ink is not None
         assert min(ink[0], ink[1], image.width - ink[2], image.height - ink[3]) >= 1
+
+
+def test_no_figure_places_its_axes_by_inches() -> None:
+    """Matplotlib does, by its constrained layout."""
+    sources = list((Path(__file__).parents[3] / "study").rglob("*.py"))
+    assert len(sources) > 100
+    found = [path.name for path in sources if re.search(r"add_axes|subplots_adjust|tight_layout", path.read_text())]
+    assert found == []

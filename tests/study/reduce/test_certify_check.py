@@ -12,10 +12,9 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model, build
 from softgrasp.reduction.certified.model import CertifiedModel, ParameterDomain
-from softgrasp.study.reduce.certified.measure import check_box, sizes_of
+from softgrasp.study.reduce.certified.measure import BoxCheck, check_box, sizes_of
 from softgrasp.study.reduce.certified.page import tests_table as table_of
 from softgrasp.study.reduce.certified.plots import draw
-from softgrasp.study.reduce.certified.result import BoxCheck
 from tests.helpers.certified import KELVIN_VOIGT, error_to, full_at, ritz
 from tests.helpers.models import make_scene
 

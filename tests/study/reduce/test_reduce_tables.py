@@ -6,10 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS
-from softgrasp.study.reduce.linear.findings import findings
 from softgrasp.study.reduce.linear.measure import FURTHER, chosen_methods
-from softgrasp.study.reduce.linear.page import error_table, least_size, stability
+from softgrasp.study.reduce.linear.page import error_table, findings, least_size, stability
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, best, kept_points, nearest
+from softgrasp.study.report.document import cell_text
 from tests.helpers.models import make_scene
 
 PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"
@@ -61,6 +61,7 @@ def test_table_shows_the_deformation_first_and_the_split() -> None:
     sweep = swept_of("componentwise_pod_fixed", point(6, 0.2), split, point(30, 1e-3, stable=False))
     table = error_table([sweep], 0.999)
     assert dict(zip(table.header, *table.rows, strict=True)) == {
-        "method": "componentwise POD, fixed", "99.9 %": "-", "N": "14", "V_e": "5+5", "deform.": "1 %",
-        "state": "2 %", "energy": "2 %", "to 10 %": 14, "to 1 %": 14, "to 0.1 %": "-", "stable N": "not 30",
+        "method": "componentwise POD, fixed", "99.9 %": "-", "N": "14", "V_e": "5+5", "deform.": 0.01,
+        "state": 0.02, "energy": 0.02, "to 10 %": 14, "to 1 %": 14, "to 0.1 %": "-", "stable N": "not 30",
     }  # fmt: skip
+    assert [cell_text(cell) for cell in table.rows[0][4:7]] == ["1 %", "2 %", "2 %"]  # the numbers stay whole

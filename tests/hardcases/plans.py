@@ -1,0 +1,154 @@
+"""Hard cases of plans past obstacles and of observers: no room, no damping, few markers, late samples, stiff loops."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+
+import numpy as np
+
+from softgrasp.fem.model.build import Stopwatch
+from softgrasp.lqr.constrained.least_distance import nearest
+from softgrasp.lqr.design.constrained import PlannedControl, plan_control
+from softgrasp.lqr.design.feedback import design
+from softgrasp.lqr.design.observer import ObservedControl, observe
+from softgrasp.lqr.observer.judge import loop_map
+from softgrasp.lqr.observer.reduced import reduced_filter
+from softgrasp.lqr.observer.sensors import make_disturbance
+from softgrasp.lqr.plant.checks import ControlError
+from tests.hardcases.cases import Family, HardCase, Outcome, here, make, textbook
+
+BODY = ("tissue.cells=[2, 4]", "control.constraints.N=14", "control.constraints.parts=4")
+WALL = "{kind='halfspace', normal=[-1, 0], offset=-6.05}"
+DISC = "{kind='disc', center=[3.4, 1.2], radius=0.7}"
+
+
+@cache
+def planned(*changes: str) -> PlannedControl:
+    """The plan of the paper's scene past other obstacles, on a coarse mesh."""
+    model = make("paper_obstacle", *BODY, *changes)
+    return plan_control(design(model), Stopwatch(model.system.layout.comm))
+
+
+def depth(*changes: str) -> float:
+    """How deep the body of the full plant goes into an obstacle under the plan [m]."""
+    return max(0.0, -float(planned(*changes).runs.planned.gaps.min()))
+
+
+def depth_free(*changes: str) -> float:
+    """The same under the optimal feedback, which has no obstacles."""
+    return max(0.0, -float(planned(*changes).runs.free.gaps.min()))
+
+
+def one_step(*_: str) -> float:
+    """A program that needs two rows with a limit of one step."""
+    return float(np.abs(nearest(-np.eye(2), -np.ones(2), limit=1).x - 1).max())
+
+
+PLANS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
+    ("wall 5 cm behind the target", (f"obstacle=[{WALL}]",), 0.0),
+    ("two equal walls", (f"obstacle=[{WALL}, {WALL}]",), 0.0),
+    ("slit of 2 cm around the body at the target", (
+        "obstacle=[{kind='halfspace', normal=[-1, 0], offset=-6.01}, {kind='halfspace', normal=[0, -1], offset=-5.01}]",
+    ), 0.0),
+    ("wall 3 mm behind the target", ("obstacle=[{kind='halfspace', normal=[-1, 0], offset=-6.003}]",), 0.0),
+    ("target that touches", ("obstacle=[{kind='halfspace', normal=[-1, 0], offset=-6.0}]",), None),
+    ("target inside", ("obstacle=[{kind='halfspace', normal=[-1, 0], offset=-5.9}]",), None),
+    ("disc over the start, 0.1 m deep", ("obstacle=[{kind='disc', center=[-0.6, 1.0], radius=0.7}]",), 0.101),
+    ("disc that moves", ("obstacle=[{kind='disc', center=[3.4, 1.2], radius=0.7, path={velocity=[0.1, 0]}}]",), None),
+    ("Q = 1e6", (f"obstacle=[{WALL}]", "control.Q=1e6", "control.constraints.force=60.0",
+                 "control.constraints.grid=0.1", "control.constraints.speed=20.0"), 0.0),
+    ("beta = 2e-4", (f"obstacle=[{WALL}]", "effects.damping={kind='kelvin-voigt', beta=2e-4}"), 0.0),
+    ("no damping", (f"obstacle=[{WALL}]", "effects.damping=false", "control.method='modal'"), None),
+    ("nu = 0.4999", (f"obstacle=[{WALL}]", "tissue.material={young=125.0, poisson=0.4999, rho=1.0}"), 0.0),
+    ("hand that feels the tissue", (f"obstacle=[{WALL}]", "effects.reaction=true"), None),
+    ("hand that turns", (f"obstacle=[{WALL}]", "effects.rotation=true", "hand.inertia=5.0",
+                       "motion.target=[5.0, 3.0, 0.0]", "control.outputs=[{kind='hand'}]"), None),
+)  # fmt: skip
+
+
+def plan_rows(quick: bool) -> Iterator[HardCase]:
+    """Plans with little room, and scenes that have none."""
+    for number, (name, changes, bound) in enumerate(PLANS):
+        if quick and number % 2:
+            continue
+        reason = (
+            "every gap is kept at every step" if not bound else "the depth of the start, and no more than 1 % of it"
+        )
+        if bound is None:
+            reason = "there is no room, or no bound of what the reduced plant leaves out"
+        yield HardCase(name, number + 1.0, here(depth, *changes), textbook(depth_free, *changes), bound, reason)
+    limited = textbook(lambda: Outcome(None, "has no limit"))
+    yield HardCase("one step of the active set", len(PLANS) + 1.0, here(one_step), limited, None, "it needs two")
+
+
+MARKERS = "markers=[[0, 0], [1, 0], [0, 1], [1, 1]]"
+BOTTOM = "disturbance={box=[[0, 0], [1, 0]]}"
+
+
+@cache
+def observed(table: str, *changes: str) -> ObservedControl:
+    """The observer of the paper's control problem."""
+    model = make("paper_lqr", "tissue.cells=[4, 8]", f"control.observer={{{table}, {BOTTOM}}}", *changes)
+    return observe(design(model), Stopwatch(model.system.layout.comm))
+
+
+def slower(table: str, *changes: str) -> float:
+    """By which share the loop with observer is slower than with the state known."""
+    judged = observed(table, *changes).judged
+    return max(0.0, 1 - judged.abscissa / judged.abscissa_known)
+
+
+def slower_naive(table: str, *changes: str) -> float:
+    """The same of a filter that takes its reduced plant for the full one; 1 where the full loop is not stable."""
+    found = observed(table, *changes)
+    model = make("paper_lqr", "tissue.cells=[4, 8]", *changes)
+    problem = design(model).problem
+    acting, own = make_disturbance(problem, 0.02, 0.05, [[0, 0], [1, 0]]), found.reduced
+    try:
+        plant, sensors, period, late = found.loop.plant, found.sensors, found.controller.period, own.filter.delay
+        naive = reduced_filter(problem, plant, sensors, acting, own.plant.N, period, late, weight=0.0)
+    except ControlError:
+        return 1.0
+    values = np.linalg.eigvals(loop_map(found.ticks, found.controller.K, naive.filter).F)
+    rate = float(np.log(np.abs(values).max())) / found.controller.period
+    return min(1.0, max(0.0, 1 - rate / found.judged.abscissa_known))
+
+
+OBSERVERS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
+    ("four markers, Q = 1e6", (MARKERS, "control.Q=1e6"), 0.02),
+    ("four markers", (MARKERS,), 0.02),
+    ("one marker", ("markers=[[0, 0]]",), 0.02),
+    ("force alone", ("noise={force=0.01}",), 0.02),
+    ("samples one tick late", (f"{MARKERS}, delay=1",), 0.02),
+    ("samples 20 ticks late", (f"{MARKERS}, delay=20",), 0.02),
+    ("markers of a micrometre", (f"{MARKERS}, noise={{marker=1e-6}}",), 0.02),
+    ("markers of a kilometre", (f"{MARKERS}, noise={{marker=1e3}}",), 0.2),
+    ("beta = 2e-4", (MARKERS, "effects.damping={kind='kelvin-voigt', beta=2e-4}"), 0.02),
+    ("no damping", (MARKERS, "effects.damping=false", "control.method='modal'"), None),
+    ("nu = 0.4999", (MARKERS, "tissue.material={young=125.0, poisson=0.4999, rho=1.0}"), 0.02),
+    ("hand that feels the tissue, 0.5 kg", (MARKERS, "effects.reaction=true", "hand.mass=0.5"), 0.02),
+    ("two markers on one node", ("markers=[[0, 0], [0.01, 0]]",), None),
+)
+
+
+def observer_rows(quick: bool) -> Iterator[HardCase]:
+    """Observers with few, late, fine and coarse samples."""
+    for number, (name, arguments, bound) in enumerate(OBSERVERS):
+        if quick and number % 2:
+            continue
+        reason = "there is nothing to estimate with" if bound is None else "the gain sets the pace, not the estimate"
+        yield HardCase(name, number + 1.0, here(slower, *arguments), textbook(slower_naive, *arguments), bound, reason)
+
+
+FAMILIES = (
+    Family("obstacles", "Plans past obstacles", "case", "depth of the body in an obstacle [m]", "optimal feedback",
+           "The optimal feedback has no obstacles and goes through them. The plan keeps every gap on the full plant, "
+           "with millimetres of room and stiff loops; where there is no plan a sentence says so.",
+           plan_rows, axis="listed"),
+    Family("observers", "Observers of the tissue", "case", "share by which the loop is slower [1]",
+           "filter of the reduced plant alone",
+           "A filter that takes its reduced plant for the full one may slow the full loop or upset it, and nothing on "
+           "its own plant shows it. Here what it leaves out is noise, and the full plant with all modes decides.",
+           observer_rows, axis="listed"),
+)  # fmt: skip

@@ -1,0 +1,117 @@
+"""Reduced models with contact against full runs on motions they were not made for, and their balance of energy."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.petsc import total
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.reduction.contact.model import contact_model
+from softgrasp.reduction.contact.stepper import ContactSteps
+from softgrasp.reduction.system import ModelError
+
+TABLE = "obstacle=[{kind='halfspace', name='table', normal=[0, 1], offset=-0.05}]"
+SCENE = ["effects.obstacles=true", "effects.gravity={g=[0, -1]}", "effects.damping={kind='kelvin-voigt', beta=0.005}",
+         "output.snapshots='memory'", "time.start='equilibrium'"]  # fmt: skip
+MADE = "motion={target=[0.5, -0.12], duration=2.0}"
+OTHER = "motion={target=[-0.8, -0.15], duration=2.0}"  # the other way, faster and deeper
+SHORT = ["tissue.cells=[5, 10]", "time={steps=300, end=3.0, start='equilibrium'}"]
+LONG = ["time={steps=600, end=3.0, start='equilibrium'}"]
+
+
+def landing(*overrides: str, comm: MPI.Intracomm = MPI.COMM_SELF) -> Model:
+    return build("paper_forward", [*SCENE, TABLE, *overrides], comm)
+
+
+def errors(full: Any, run: Any, V: Any, comm: MPI.Intracomm) -> tuple[float, float]:
+    """Of z over all nodes and steps, and of the force of the table, in the mean of squares [1]."""
+    Z, F = full.snapshots.Z[: len(V)], full.contact.force
+    off, size = total(comm, np.array([((V @ run.a.T - Z) ** 2).sum(), (Z**2).sum()]))
+    return float(np.sqrt(off / size)), float(np.linalg.norm(run.force - F) / np.linalg.norm(F))
+
+
+@pytest.mark.serial
+def test_thirty_columns_repeat_a_motion_they_were_not_made_for() -> None:
+    rom = contact_model(landing(MADE, *LONG))  # 15 by 30 cells, as the scene ships
+    full = simulate(landing(OTHER, *LONG))
+    run = rom.run(full.q_s, full.v_s, rom.dt)
+    z, force = errors(full, run, rom.V, MPI.COMM_SELF)
+    assert rom.N <= 30
+    assert full.contact is not None
+    assert (full.contact.touching > 0).mean() > 0.2
+    assert z < 1e-3  # asked for; measured 9.2e-4
+    assert force < 1e-2  # asked for; measured 4.2e-3
+    assert run.gap.min() > -1e-14  # of a body of 2 m
+    # as far as z from the full run, relative to the deformation
+    assert np.abs(run.outputs - full.outputs).max() < 2e-3 * np.abs(full.outputs - full.outputs_rigid).max()
+
+
+@pytest.mark.ranks(2)
+@pytest.mark.parametrize(
+    "table",
+    [TABLE, "obstacle=[{kind='halfspace', normal=[0.05, 1], offset=-0.09, path={velocity=[0, 0.02]}}]"],
+)
+def test_more_modes_come_closer_and_ranks_agree(table: str, comm: MPI.Intracomm) -> None:
+    model = landing(MADE, *SHORT, table, comm=comm)
+    full = simulate(model)
+    few, many = (contact_model(model, modes) for modes in (3, 24))
+    runs = [rom.run(*rom.motion(), rom.dt) for rom in (few, many)]
+    (z, _), (closer, force) = (errors(full, run, rom.V, comm) for rom, run in zip((few, many), runs, strict=True))
+    assert closer < z / 3  # converges
+    assert force < 1e-2
+    alone = contact_model(landing(MADE, *SHORT, table), 24)
+    assert np.abs(alone.run(*alone.motion(), alone.dt).outputs - runs[1].outputs).max() < 1e-9  # of a path of 0.5 m
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("engine", ["C", "NumPy"])
+def test_the_balance_closes(engine: str) -> None:
+    rom = contact_model(landing(MADE, *SHORT))
+    rng, steps, p, k = np.random.default_rng(2), 400, 6, rom.N
+    N = rng.standard_normal((p, k)) / np.sqrt(rom.stiffness)
+    stepper = ContactSteps(rom.stiffness, rom.D, N, 0.01)
+    load = np.tile(-N.sum(axis=0) * 30.0, (steps, 1))  # towards all planes
+    still = np.zeros((steps + 1, p))
+    a, v, x, y = stepper.march(np.zeros(k), load, still + 0.013, still, 1e-14, engine)
+    assert (x > 0).any()
+    assert (y != 0).any()
+    moved, rate = np.diff(a, axis=0), v[1:] - y @ N / 2  # of the impulses the mean of before and after
+    gained = np.einsum("ij,ij", moved, load + x @ N) + np.einsum("ij,ij", y @ N, rate)
+    lost = np.einsum("ij,jk,ik", moved, rom.D, moved) / 0.01
+    energy = (v**2 + rom.stiffness * a**2).sum(axis=1) / 2
+    assert energy[-1] - energy[0] == pytest.approx(gained - lost, abs=1e-12 * energy.max())  # rounding of 400 steps
+    assert (0.013 + a @ N.T).min() > -1e-13
+
+
+@pytest.mark.serial
+def test_compiled_and_numpy_steps_agree() -> None:
+    rom = contact_model(landing(MADE, *SHORT))
+    one, other = (rom.run(*rom.motion(), rom.dt, engine) for engine in ("C", "NumPy"))
+    assert np.abs(one.a - other.a).max() < 1e-11 * np.abs(one.a).max()  # rounding of 300 steps
+    assert np.array_equal(one.touching, other.touching)
+
+
+@pytest.mark.serial
+def test_what_it_cannot_do_is_refused() -> None:
+    model = landing(MADE, *SHORT)
+    with pytest.raises(ModelError, match="keeps half-spaces, whose normals do not turn, and no disc"):
+        contact_model(landing(MADE, *SHORT, "obstacle=[{kind='disc', center=[0.5, -1], radius=0.5}]"))
+    with pytest.raises(ModelError, match="contact_model has no friction yet"):
+        contact_model(landing(MADE, *SHORT, TABLE.replace("}", ", friction=0.1}")))
+    with pytest.raises(ModelError, match=r"effects\.reaction = false"):
+        contact_model(landing(MADE, *SHORT, "effects.reaction=true"))
+    with pytest.raises(ModelError, match=r"no boundary node comes within reach = 0.001 m"):
+        contact_model(landing("motion={profile='hold'}", *SHORT), reach=1e-3)
+    rom = contact_model(model)
+    inside = dataclasses.replace(rom, kept=rom.kept[:2])
+    with pytest.raises(ModelError, match=r"a boundary node without a row is .* m in obstacle 'table'; give .* reach"):
+        inside.run(*rom.motion(), rom.dt)
+    q, v = rom.motion()
+    with pytest.raises(ModelError, match=r"'table' is .* m in the tissue at the start"):
+        rom.run(q - [0.0, 0.1], v, rom.dt)
