@@ -209,7 +209,7 @@ def compose(comparison: Comparison, session: Session, b: Path) -> Page:
     parts = [
         Section("", figures=[(file, "A and B, and their difference.") for file in drawn[:1]]),
         *([keys.section(title="Keys of the scene", terminal=True)] if keys.rows else []),
-        numbers.section(title="Numbers of result.json", terminal=True),
+        *([numbers.section(title="Numbers of result.json", terminal=True)] if numbers.rows else []),
     ]
     return Page(
         f"{a.name} (A) and {b.name} (B)",
