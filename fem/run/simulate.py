@@ -57,6 +57,7 @@ class RunOptions:
     frame: Observer | None = None  # call with the run at the start, the end and ``output.frames`` steps between
     begin: Observer | None = None  # call with the run before the first step, after a restart file was read
     keep: Observer | None = None  # call with the run before every restart file, to add files to :attr:`Run.beside`
+    settle: Callable[[float], None] | None = None  # call with the share of its digits that an iterated equilibrium has
     few: int | None = None  # number of states kept in memory with output.snapshots = "auto" [1]; None keeps all
 
 
@@ -74,7 +75,7 @@ class Run(Stepped):
 
     def __init__(self, model: Model, options: RunOptions, force: Force | None = None) -> None:
         scene, system = model.scene, model.system
-        self.model, self.end = model, scene.time_end
+        self.model, self.end, self.settle = model, scene.time_end, options.settle
         dt, (name, reason) = self.end / scene.time.steps, solver_of(scene, system.layout)
         with model.watch.stage("factor"):
             grid = scene.time
@@ -141,7 +142,7 @@ class Run(Stepped):
             from softgrasp.fem.run.contact_rest import resting  # only scenes with contact pay for it
 
             return resting(self.contact, self.drive.q[0], time)
-        return equilibrium(system, choose_solver(system.layout, time.solver, few=True)[0], time)
+        return equilibrium(system, choose_solver(system.layout, time.solver, few=True)[0], time, self.settle)
 
     def take(self, ts: Any, step: int, check: bool = False) -> None:
         """Step up to a number, and see that the forces on the way were finite. Collective.

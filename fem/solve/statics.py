@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +12,7 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, from_options
 from softgrasp.fem.scene.scene import Time
-from softgrasp.fem.solve.solvers import SolverName, TissueSolver, choose_solver, make_solver
+from softgrasp.fem.solve.solvers import ITERATIVE, SolverName, TissueSolver, choose_solver, make_solver
 from softgrasp.fem.solve.stiffness import factored_stiffness
 from softgrasp.fem.system import BlockSystem
 
@@ -18,12 +20,18 @@ if TYPE_CHECKING:
     from softgrasp.fem.strain.body import HyperelasticBody
 
 
-def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Time | None = None) -> Array:
+def equilibrium(
+    system: BlockSystem,
+    solver: SolverName | None = None,
+    time: Time | None = None,
+    notify: Callable[[float], None] | None = None,
+) -> Array:
     """Static displacement relative to the hand, K_ee z = G g or f(z) = G g; local rows (n_local,) [m]. Collective.
 
     Args:
         solver: its name; None: the one that suits few solves.
         time: for the reproducibility of the scene.
+        notify: called with the share of its digits that an iteration has, from 0 to 1; a factor says nothing.
 
     Raises:
         SolverError: the stiffness is singular or the residual too large, or the loads of finite strain do not converge.
@@ -33,8 +41,29 @@ def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Tim
     if system.points is not None:
         return finite_equilibrium(system, solver)
     load = (system.G @ system.gravity)[:, None]
-    with factored_stiffness(system, solver, reproducible="auto" if time is None else time.reproducible) as factor:
+    bits = "auto" if time is None else time.reproducible
+    with factored_stiffness(system, solver, reproducible=bits) as factor, _watched(factor, notify):
         return factor.columns(load, "the static equilibrium")[:, 0]
+
+
+@contextmanager
+def _watched(factor: TissueSolver, notify: Callable[[float], None] | None) -> Iterator[None]:
+    """Call with the share of the digits that a solve has, on a log scale. Collective."""
+    if notify is None or factor.name not in ITERATIVE:
+        yield
+        return
+    digits, first = -np.log10(factor.ksp.getTolerances()[0]), [0.0]
+
+    def monitor(_: PETSc.KSP, iteration: int, norm: float) -> None:
+        first[0] = first[0] if iteration else norm
+        if norm > 0:
+            notify(float(np.clip(np.log10(first[0] / norm) / digits, 0.0, 1.0)))
+
+    factor.ksp.setMonitor(monitor)
+    try:
+        yield
+    finally:
+        factor.ksp.monitorCancel()
 
 
 def solve_columns(

@@ -121,6 +121,39 @@ def run_plan(
     return PlanRuns(planned, free, dt, _largest(exact - reduced), _largest(off))
 
 
+def run_inputs(
+    problem: RiccatiProblem,
+    solution: RiccatiSolution,
+    plan: Plan,
+    surface: Surface,
+    start: PlantState,
+    target: Target,
+    steps: int,
+) -> BodyRun:
+    """Run another plant, one of finite strain for example, under the inputs of a plan. Collective.
+
+    Args:
+        solution: optimal feedback of the linear plant, and the cost that is still to come at the end.
+        surface: nodes of the body on its boundary.
+        start: state at t = 0.
+        target: state of this plant at rest.
+        steps: of the midpoint rule, in each part of an interval.
+
+    Raises SolverError: a solve failed.
+    """
+    each = plan.horizon.plant.parts * steps
+    loop = ClosedLoop(watching(problem, surface), plan.horizon.plant.grid / each)
+    try:
+        inputs = np.repeat(plan.inputs, each, axis=0)
+        run = LoopRun(
+            loop, OpenDrive(loop.plant, inputs), start, len(inputs), LoopOptions(), target_of(loop.problem, target)
+        )
+        run.execute()
+        return body_run(problem, solution, plan, surface, run.trajectory(Actuation()), target)
+    finally:
+        loop.destroy()
+
+
 def _largest(vectors: Array) -> float:
     return float(np.linalg.norm(vectors, axis=-1).max())
 

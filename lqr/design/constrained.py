@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.linalg
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.obstacles import Obstacle, make_obstacles
 from softgrasp.fem.petsc import Array, on_root, total
@@ -16,18 +17,21 @@ from softgrasp.lqr.constrained.horizon import held_plant
 from softgrasp.lqr.constrained.plan import Plan, Task, make_plan
 from softgrasp.lqr.constrained.pulse import PulseError
 from softgrasp.lqr.constrained.rows import Limits
-from softgrasp.lqr.constrained.run import STEPS, PlanRuns, run_plan
+from softgrasp.lqr.constrained.run import STEPS, PlanRuns, run_inputs, run_plan
 from softgrasp.lqr.constrained.separation import separate
 from softgrasp.lqr.constrained.tissue import ModalTissue, Surface, make_surface, modal_tissue
 from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.design.linearise import finite_problem
 from softgrasp.lqr.design.scene import control_of, problem
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.lqr.plant.target import rest
 
 if TYPE_CHECKING:  # observers are not imported where a scene has none
     from softgrasp.lqr.design.observer import ObservedControl
     from softgrasp.lqr.observer.tube import Tube
 
+FINITE_STEPS = 5  # of a run of finite strain in each part of an interval: 25 ms at the defaults
 SETTLED = 5.0  # time constants of the hand alone that the first horizon lasts: 0.7 % of the way are left
 AT_REST = 1e-9  # of the body: a start so near to equilibrium is one
 
@@ -71,6 +75,36 @@ class PlannedTube:
     """Instants of the noisy run that are kept [s], (count,)."""
     gaps: Array
     """Distance of body and obstacle in that run, negative where they overlap [m], (count, obstacles)."""
+
+
+@dataclass(frozen=True)
+class FinitePlan:
+    """A plan of the linear plant on that of finite strain."""
+
+    gaps: Array
+    """Least distance of body and obstacle, negative where they overlap [m], (obstacles,); empty where it failed."""
+    error: float
+    """Largest distance of a node from where the linear plant has it at the same instant [m]."""
+    reason: str = ""
+    """Why the run failed; else empty."""
+
+
+def run_plan_finite(design: Design, model: Model, planned: PlannedControl) -> FinitePlan:
+    """The inputs of a plan on the plant of finite strain, from the same start. Collective.
+
+    Raises SolverError: there is no equilibrium under gravity.
+    """
+    problem, target = finite_problem(design.problem, model.system, design.target)
+    start = rest(model.system, deformed=model.scene.time.start == "equilibrium")
+    try:
+        run = run_inputs(problem, design.solution, planned.plan, planned.surface, start, target, FINITE_STEPS)
+    except SolverError as error:  # it diverges, or leaves what the law describes
+        return FinitePlan(np.zeros(0), np.inf, str(error))
+    # with the same steps, whose error is that of both
+    linear = run_inputs(
+        design.problem, design.solution, planned.plan, planned.surface, design.start, design.target, FINITE_STEPS
+    )
+    return FinitePlan(run.least, float(np.linalg.norm(run.body - linear.body, axis=2).max()))
 
 
 def plan_control(

@@ -137,7 +137,7 @@ def loop_study(
         from softgrasp.study.control.obstacle.measure import planned_study  # no other scene needs it
 
         found = None if observed is None else observed.observed
-        planned = planned_study(feedback, watch, counted(bar, "plan on the full plant"), found)
+        planned = planned_study(feedback, model, watch, counted(bar, "plan on the full plant"), found)
     bases: tuple[BasisGains, ...] = ()
     if feedback.modal:
         reason = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"

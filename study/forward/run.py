@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
 from rich.console import Console
-from rich.progress import MofNCompleteColumn
+from rich.progress import MofNCompleteColumn, Progress
 
-from softgrasp.fem import EFFECTS, FRAMES, Scene, check_ranks, counted, forecasts, frame_count, run_seconds, told
+from softgrasp.fem import EFFECTS, FRAMES, Model, check_ranks, counted, forecasts, frame_count, run_seconds, told
 from softgrasp.fem.accuracy.price import SHARE
 from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError, SolverError
+from softgrasp.fem.run.forecast import Forecast
 from softgrasp.fem.run.frames import LIGHT
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estimate_error
@@ -22,6 +24,7 @@ from softgrasp.study.pictures import Frames, speed_up
 from softgrasp.study.report import Page, Section, captioned, of_scene
 from softgrasp.study.shell import Flags, Session, folder_lock, list_files
 
+SLOW_START = 5.0  # time of the equilibrium from which it is announced [s]
 CAPTIONS = {
     "move.png": "The body at some instants of the move.",
     "move.gif": "",
@@ -55,7 +58,7 @@ def run_simulate(
     model = session.model(scene)
     model.system.release()
     scene, frames, n_e = model.scene, Frames(model, out, session.pictures), model.system.layout.n_e
-    for text in filter(None, (told(forecasts(model)), _few_fields(scene, n_e), *small_obstacles(model))):
+    for text in _announced(model):
         console.print(text, soft_wrap=True)
 
     def join(run: Run) -> None:
@@ -71,7 +74,8 @@ def run_simulate(
             kind = "steps" if newton is None else f"steps ({newton.mean:.2g} iterations each)"
             bar.update(task, completed=run.reached, description=kind)
 
-        options = RunOptions(out, resume, until, progress, frames, join, frames.keep, looked_at(n_e))
+        settle = _equilibrium_bar(bar)
+        options = RunOptions(out, resume, until, progress, frames, join, frames.keep, settle, looked_at(n_e))
         try:
             run = simulate(model, options)
         except (Interrupted, ResourceError) as stopped:
@@ -114,8 +118,28 @@ def _say_stopped(console: Console, frames: Frames, stopped: Interrupted | Resour
     console.print(str(stopped), soft_wrap=True, markup=False)
 
 
-def _few_fields(scene: Scene, n_e: int) -> str:
+def _equilibrium_bar(bar: Progress) -> Callable[[float], None]:
+    """A bar of the digits of an iterated equilibrium, shown while it is solved."""
+    task = bar.add_task("equilibrium, percent of its digits", total=100, visible=False)
+    return lambda share: bar.update(task, completed=round(100 * share), visible=share < 1)
+
+
+def _announced(model: Model) -> Iterator[str]:
+    """What a run says before it starts. Collective."""
+    modelled = forecasts(model)
+    start = _slow_start(modelled, model.system.layout.comm.size)
+    yield from filter(None, (told(modelled), start, _few_fields(model), *small_obstacles(model)))
+
+
+def _slow_start(modelled: Sequence[Forecast], ranks: int) -> str:
+    """How long the equilibrium takes before the first step, where that is a while."""
+    seconds = next((f.equilibrium for f in modelled if f.ranks == ranks), 0.0)
+    return f"about {seconds:.2g} s of that are the equilibrium, before the first step" if seconds >= SLOW_START else ""
+
+
+def _few_fields(model: Model) -> str:
     """That a large body has its fields written at few instants, unless the scene says at how many."""
+    scene, n_e = model.scene, model.system.layout.n_e
     count = frame_count(scene, n_e)
     if count >= FRAMES or scene.output.frames != "auto" or scene.output.fields == "none":
         return ""

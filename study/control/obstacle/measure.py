@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem import Stopwatch, on_root
+from softgrasp.fem import Model, Stopwatch, on_root
 from softgrasp.lqr import Design, Notify, Plan, control_of, plan_control, quadratic_program
 from softgrasp.lqr.constrained.least_distance import nearest
+from softgrasp.lqr.design.constrained import run_plan_finite
 from softgrasp.study.control.obstacle.result import PlannedStudy
 from softgrasp.study.shell import repeated
 
@@ -22,12 +23,20 @@ MOVED = 1e-3  # by which their gaps and limits differ from it, at most [m, N, m/
 
 
 def planned_study(
-    design: Design, watch: Stopwatch, notify: Notify, observed: ObservedControl | None = None
+    design: Design, model: Model, watch: Stopwatch, notify: Notify, observed: ObservedControl | None = None
 ) -> PlannedStudy:
-    """Plan, runs and times. Collective. Raises ControlError, SolverError: see :func:`plan_control`."""
+    """Plan, runs and times; ``model`` may have finite strain. Collective.
+
+    Raises ControlError, SolverError: see :func:`plan_control`.
+    """
     planned = plan_control(design, watch, notify, observed)
     rows, cold, warm = on_root(design.problem.layout.comm, lambda: times(planned.plan))
-    return PlannedStudy(planned, design.gain_check.optimal, rows, cold, warm, 1 / control_of(design.model).loop.rate)
+    finite = None
+    if model.system.points is not None:
+        with watch.stage("plan at finite strain"):
+            finite = run_plan_finite(design, model, planned)
+    tick = 1 / control_of(design.model).loop.rate
+    return PlannedStudy(planned, design.gain_check.optimal, rows, cold, warm, tick, finite)
 
 
 def times(plan: Plan) -> tuple[int, tuple[float, ...], tuple[float, ...]]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from softgrasp.fem import AXES
 from softgrasp.lqr import Plan
+from softgrasp.lqr.design.constrained import FinitePlan
 from softgrasp.study.control.obstacle.result import PlannedStudy
 from softgrasp.study.report import Section, Table, captioned, listed
 
@@ -88,6 +89,8 @@ def facts(study: PlannedStudy) -> list[tuple[str, str]]:
             ("error of the run's own step", f"{runs.step_error:.2g} m, measured against the exact modes"),
             ("cost of a metre of one gap at one instant", f"{plan.multiplier:.3g} at most"),
         ]
+    if study.finite is not None:
+        rows.append(("on the plant of finite strain", _finite(study.finite)))
     rows += [
         ("excess cost", f"{study.excess:.3%}, of which held forces {study.excess_held:.3%}"),
         ("cost predicted and run", f"{plan.cost:.6g} and {runs.planned.cost:.6g}"),
@@ -120,6 +123,15 @@ def _noisy(study: PlannedStudy) -> list[tuple[str, str]]:
         ("margin for noise", f"{np.max(task.noise):.3g} m, a node deviates by {sd:.2g} m: an estimate, no bound"),
         ("least gap of a run with noise", f"{tube.gaps.min():.3g} m, the observer's feedback around the plan"),
     ]
+
+
+def _finite(finite: FinitePlan) -> str:
+    """Least gap at finite strain, and by how much the linear plant errs there."""
+    if finite.reason:
+        return f"the run fails: {finite.reason}"
+    least = float(finite.gaps.min(initial=np.inf))
+    kept = "every gap is kept" if least >= 0 else f"a gap is exceeded by {-least:.2g} m"
+    return f"{kept}; the linear plant errs by up to {finite.error:.2g} m, an estimate of the clearance to give"
 
 
 def _held(plan: Plan) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from softgrasp.lqr import PlannedControl
+from softgrasp.lqr.design.constrained import FinitePlan
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class PlannedStudy:
     seconds_cold: tuple[float, ...]  # time of the quadratic program without a guess [s]
     seconds_warm: tuple[float, ...]  # time of programs nearby from the rows that hold its solution [s]
     tick: float  # time between two ticks of the loop [s]
+    finite: FinitePlan | None = None  # the plan on the plant of finite strain; None where the effect is off
 
     @property
     def excess(self) -> float:
@@ -55,6 +57,7 @@ class PlannedStudy:
             **({} if tube is None else {"gap_min_noisy": tube.gaps.min(axis=0).tolist()}),
             "error_of_reduced_plant": runs.reduction_error,
             "error_of_run_step": runs.step_error,
+            **({} if self.finite is None else {"finite_strain": _finite(self.finite)}),
             "certified": plan.certified,
             "reason": plan.reason,
             "gap_certified": plan.gap if task.bounded and np.isfinite(plan.gap) else None,
@@ -84,3 +87,9 @@ class PlannedStudy:
             "time_cold": [float(np.median(self.seconds_cold)), max(self.seconds_cold)],
             "time_warm": [float(np.median(self.seconds_warm)), max(self.seconds_warm)],
         }
+
+
+def _finite(finite: FinitePlan) -> dict[str, Any]:
+    """The key "finite_strain" of a plan."""
+    violation = max(0.0, -float(finite.gaps.min(initial=0.0))) if not finite.reason else None
+    return {"gap_min": finite.gaps.tolist(), "violation": violation, "error": finite.error, "reason": finite.reason}

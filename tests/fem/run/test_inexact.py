@@ -139,3 +139,17 @@ def test_finite_strain_steps_with_stars(comm: MPI.Intracomm) -> None:
     run = silicone(comm, "damped", *finite, "time.solver=stars")
     assert run.energy_drift < 1e-12  # as of direct solves
     assert apart(run, exact) < 1e-7  # finite_strain.tol is 1e-9 a step; measured 1e-9
+
+
+@pytest.mark.ranks
+def test_an_iterated_equilibrium_says_how_far_it_is(comm: MPI.Intracomm) -> None:
+    few = [*SILICONE, *FEW, "time.steps=2", "tissue.cells=[3,2,4]", "time.solver=stars"]
+    shares: list[float] = []
+    told, plain = (
+        simulate(build("block_3d", few, comm), RunOptions(settle=notify)) for notify in (shares.append, None)
+    )
+    assert shares[0] == 0.0
+    assert 0.2 < np.median(shares) < 0.8  # digits come evenly
+    assert shares[-1] == 1.0
+    assert len(shares) > 10  # one an iteration
+    assert (told.outputs == plain.outputs).all()

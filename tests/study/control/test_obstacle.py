@@ -64,7 +64,7 @@ def test_page_files_and_numbers_agree(tmp_path: Path) -> None:
 def test_explain_names_the_program_that_control_solves() -> None:
     overrides = [*SMALL, "control.constraints.horizon=34", "control.constraints.margin=1e-3"]
     model = build(load_scene("paper_obstacle", overrides))
-    found = planned_study(design(model), Stopwatch(model.system.layout.comm), lambda *_: None).result()
+    found = planned_study(design(model), model, Stopwatch(model.system.layout.comm), lambda *_: None).result()
     sizes = plan_sizes(model)
     assert sizes is not None
     for key in ("N", "grid", "intervals", "variables", "rows"):
@@ -72,6 +72,21 @@ def test_explain_names_the_program_that_control_solves() -> None:
     assert found["margin"]["reduced_plant"] == 1e-3
     assert not found["certified"]  # a number is no bound
     assert "control.constraints.margin is a number" in found["reason"]
+
+
+def test_plan_of_the_linear_plant_runs_at_finite_strain(tmp_path: Path) -> None:
+    finite = "effects.finite_strain={law='neo-hooke'}"
+    soft, _ = control(tmp_path / "soft", finite, "tissue.cells=[2,4]")
+    hard, text = control(
+        tmp_path / "hard", finite, "tissue.cells=[2,4]", "tissue.material={lambda=500.0,mu=500.0,rho=1.0}"
+    )
+    errors = [result["obstacle"]["finite_strain"]["error"] for result in (soft, hard)]
+    # deformations of the stiffer tissue are a tenth, the linear plant errs by their square: 0.29 mm and 4 um
+    assert 0 < errors[1] < 0.03 * errors[0] < 0.03 * 1e-3
+    found = soft["obstacle"]["finite_strain"]
+    assert found["violation"] == max(0.0, -min(found["gap_min"]))
+    assert min(found["gap_min"]) > min(soft["obstacle"]["gap_min"]) - found["error"]
+    assert "the linear plant errs by up to" in text
 
 
 @pytest.mark.parametrize(

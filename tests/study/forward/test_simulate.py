@@ -15,8 +15,10 @@ from rich.console import Console
 
 import softgrasp as sg
 from softgrasp.fem.errors import CheckpointError, SceneError, SolverError
-from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.run.forecast import forecasts
 from softgrasp.fem.scene.file import shipped_scenes
+from softgrasp.study.forward import run as run_module
 from softgrasp.study.forward.run import run_simulate
 from tests.helpers.models import rough_save
 
@@ -141,3 +143,14 @@ def test_certify_at_finite_strain_is_refused_before_the_run(mpi_tmp_path: Path) 
     with pytest.raises(SceneError, match="for linear elasticity only: leave out --certify"):
         run(mpi_tmp_path / "out", "effects.finite_strain={law='neo-hooke'}", certify=True)
     assert not (mpi_tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("least", [0.0, 1e9])
+def test_a_slow_equilibrium_is_announced(least: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_module, "SLOW_START", least)
+    model = build("block_3d", ["tissue.refine=false", "tissue.cells=[2,2,4]", "tissue.order=1"], comm=MPI.COMM_SELF)
+    lines = list(run_module._announced(model))
+    (seconds,) = [f.equilibrium for f in forecasts(model) if f.ranks == 1]
+    line = f"about {seconds:.2g} s of that are the equilibrium, before the first step"
+    assert lines[0].startswith("cost model: about")
+    assert (lines[1:2] == [line]) is (least == 0.0)
