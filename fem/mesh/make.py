@@ -19,7 +19,8 @@ def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
     """
     tissue = scene.tissue
     if scene._given is not None:
-        return scene._given.on(comm)
+        mesh: TissueMesh = scene._given.on(comm)
+        return mesh
     if tissue.size:
         return structured_mesh(comm, tissue.size, tissue.cells or [], tissue.origin)
     from softgrasp.fem.mesh.file import read_mesh  # meshio is needed for mesh files only

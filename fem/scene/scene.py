@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, PrivateAttr, model_validator
 
@@ -19,9 +19,6 @@ from softgrasp.fem.scene.control import BASES, Control, ControlOutput, Loop, Red
 from softgrasp.fem.scene.obstacles import Obstacle, check_obstacle_vectors, check_obstacles
 from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, NonNegative, Positive, Section, Tissue
 from softgrasp.fem.shown import Card, Shown, brief, listed
-
-if TYPE_CHECKING:
-    from softgrasp.fem.mesh.given import GivenMesh
 
 __all__ = [
     "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Loop", "Material",
@@ -203,7 +200,7 @@ class Scene(Shown, Section):
     """results that are kept [no unit]"""
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
     _mesh_digest: str = PrivateAttr("")  # of the mesh file, once it was read
-    _given: GivenMesh | None = PrivateAttr(None)  # mesh of the user's own in the place of the file
+    _given: Any = PrivateAttr(None)  # `GivenMesh` in the place of the file, or None
 
     def card(self) -> Card:
         """Purpose, body, effects, motion and steps."""
