@@ -1,4 +1,4 @@
-"""Obstacles: the boundary of the tissue meets rigid bodies, without friction."""
+"""Obstacles: the boundary of the tissue meets rigid bodies, with friction where they have any."""
 
 from __future__ import annotations
 

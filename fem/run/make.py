@@ -29,7 +29,7 @@ def make_midpoint(
                 f"contact needs a factor of the step, and '{solver}' has none; use time.solver = 'mumps' and "
                 "the memory for it, or a coarser mesh"
             )
-        from softgrasp.fem.run.contact_step import ContactMidpoint  # only scenes with contact pay for it
+        from softgrasp.fem.run.contact.step import ContactMidpoint  # only scenes with contact pay for it
 
         return ContactMidpoint(system, dt, solver, reproducible=reproducible)
     if rtol is None:

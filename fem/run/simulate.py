@@ -39,8 +39,8 @@ from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
 
 if TYPE_CHECKING:
-    from softgrasp.fem.run.contact import Contact
-    from softgrasp.fem.run.contact_step import ContactDrive
+    from softgrasp.fem.run.contact.general import Contact
+    from softgrasp.fem.run.contact.step import ContactDrive
 
 Observer = Callable[["Run"], None]
 """Called between segments and at every frame; collective, may raise to end the run."""
@@ -90,7 +90,7 @@ class Run(Stepped):
         self.drive: TableDrive | ForceDrive | ContactDrive = self._make_drive(force)
         self.contact: Contact | None = None
         if scene.effects.obstacles:
-            from softgrasp.fem.run.contact_step import make_contact  # only scenes with contact pay for it
+            from softgrasp.fem.run.contact.step import make_contact  # only scenes with contact pay for it
 
             self.drive, self.contact = make_contact(model, midpoint, self.drive, self.steps)
         self.pulls = np.zeros((self.steps + 1, len(midpoint.pull())))
@@ -139,7 +139,7 @@ class Run(Stepped):
         """Static displacement against the hand, (n_local,) [m]. Collective."""
         time, system = self.model.scene.time, self.model.system
         if self.contact is not None:
-            from softgrasp.fem.run.contact_rest import resting  # only scenes with contact pay for it
+            from softgrasp.fem.run.contact.rest import resting  # only scenes with contact pay for it
 
             return resting(self.contact, self.drive.q[0], time)
         return equilibrium(system, choose_solver(system.layout, time.solver, few=True)[0], time, self.settle)

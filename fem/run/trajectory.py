@@ -16,7 +16,7 @@ from softgrasp.fem.solve.solvers import SolverUsed
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
-    from softgrasp.fem.run.contact_record import ContactRecord
+    from softgrasp.fem.run.contact.record import ContactRecord
     from softgrasp.fem.strain.newton import NewtonFigures
 
 

@@ -87,7 +87,7 @@ class Effects(Section):
     finite_strain: Dropped[FiniteStrain] = Field(
         None, description="large deformation, finite strain {law, tol [1]}; off unless given"
     )
-    obstacles: bool = Field(False, description="the tissue meets the obstacles, without friction [no unit]")
+    obstacles: bool = Field(False, description="the tissue meets the obstacles [no unit]")
 
 
 class Motion(Section):
@@ -282,6 +282,8 @@ class Scene(Shown, Section):
         check_obstacles(self.obstacle, used=planned or effects.obstacles)
         if effects.obstacles:
             _check_contact(self)
+        elif any(obstacle.friction for obstacle in self.obstacle or []):
+            raise ValueError("obstacle has friction, which only effects.obstacles = true uses; drop friction")
         if self.dimension is not None:
             _check_vectors(self, self.dimension)
         return self

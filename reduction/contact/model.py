@@ -208,6 +208,8 @@ def contact_model(model: Model, modes: int = 10, reach: float | None = None) -> 
     layout = system.layout
     if not scene.effects.obstacles or scene.effects.reaction or scene.motion.drive == "force":
         raise ModelError("contact_model needs effects.obstacles, motion.drive = 'motion' and effects.reaction = false")
+    if any(entry.friction for entry in scene.obstacle or []):
+        raise ModelError("contact_model has no friction yet; leave out the friction of every obstacle")
     obstacles = make_obstacles(scene, layout.dimension)
     if other := [o.kind for o in obstacles if not isinstance(o.shape, HalfSpace)]:
         raise ModelError(f"contact_model keeps half-spaces, whose normals do not turn, and no {other[0]}")

@@ -13,7 +13,7 @@ from softgrasp.study.report import Table
 from softgrasp.study.report.origin import origin, peak_memory_mb
 
 if TYPE_CHECKING:
-    from softgrasp.fem.run.contact_record import ContactRecord
+    from softgrasp.fem.run.contact.record import ContactRecord
     from softgrasp.fem.strain.newton import NewtonFigures
 
 
@@ -170,6 +170,7 @@ def contact_keys(contact: ContactRecord) -> dict[str, Any]:
         "work": contact.work,
         "taken_by_touch": contact.touch,
         "taken_by_impulses": contact.stopped,
+        "taken_by_friction": contact.rubbed,
         "rounds": contact.rounds,
         "columns": contact.columns,
         "boundary_nodes": contact.nodes,
@@ -200,6 +201,7 @@ def contact_rows(contact: ContactRecord) -> list[tuple[str, str]]:
         )
         rows.append((f"obstacle {name}", touched))
     taken = f"{contact.touch:.3g} J at first touch, {contact.stopped:.3g} J by impulses"
+    taken += f", {contact.rubbed:.3g} J by friction" if contact.rubbed else ""
     return [*rows, ("taken by contact", f"{taken}; deepest penetration {contact.penetration:.1e} m")]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.contact_record import ContactRecord
+from softgrasp.fem.run.contact.record import ContactRecord
 from softgrasp.study.pictures.style import COLUMN, CYCLE, STEPS, length_unit, paper_style, save
 
 

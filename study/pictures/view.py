@@ -63,7 +63,8 @@ class Move:
         self.shown = sorted({round(i) for i in np.linspace(0, len(self.times) - 1, SHOWN)})
         sizes = np.concatenate([self._value(self._read(i)) for i in self.shown])
         # ends of the colours, from the bodies of a picture; for a vector its length counts
-        self.range = float(sizes.min()), float(np.percentile(sizes, PEAK))
+        low, high, top = (float(x) for x in (sizes.min(), np.percentile(sizes, PEAK), sizes.max()))
+        self.range = low, high if high > low else top  # few nodes may have any, as of contact
 
     def body(self, i: int) -> Any:
         """The surface of the deformed body at an instant, with the field as `value`."""

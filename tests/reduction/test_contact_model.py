@@ -102,6 +102,8 @@ def test_what_it_cannot_do_is_refused() -> None:
     model = landing(MADE, *SHORT)
     with pytest.raises(ModelError, match="keeps half-spaces, whose normals do not turn, and no disc"):
         contact_model(landing(MADE, *SHORT, "obstacle=[{kind='disc', center=[0.5, -1], radius=0.5}]"))
+    with pytest.raises(ModelError, match="contact_model has no friction yet"):
+        contact_model(landing(MADE, *SHORT, TABLE.replace("}", ", friction=0.1}")))
     with pytest.raises(ModelError, match=r"effects\.reaction = false"):
         contact_model(landing(MADE, *SHORT, "effects.reaction=true"))
     with pytest.raises(ModelError, match=r"no boundary node comes within reach = 0.001 m"):

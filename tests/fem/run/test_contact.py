@@ -270,7 +270,7 @@ def test_compiled_half_spaces_are_those_of_the_general_step(
     overrides: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compiled = run(*overrides)
-    monkeypatch.setattr("softgrasp.fem.run.contact_step.contact_library", lambda: None)
+    monkeypatch.setattr("softgrasp.fem.run.contact.step.contact_library", lambda: None)
     general = run(*overrides)
     assert general.contact.rounds >= compiled.contact.rounds > 0
     # two orders of the same sums, over 300 steps in which nodes touch and leave

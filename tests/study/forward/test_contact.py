@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from softgrasp.study.forward.explain import explain_model
 from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.pictures.body import draw_surroundings, legend, make_axes, make_shot
 from softgrasp.study.pictures.shapes import seen
+from softgrasp.study.pictures.view import Move
 
 pytestmark = pytest.mark.serial
 SCENE = ["tissue.cells=[4, 8]", "motion={profile='hold'}", "effects.gravity={g=[0, -5]}", "time.steps=100",
@@ -118,6 +120,11 @@ def test_field_files_hold_the_traction_whose_integral_is_the_force(tmp_path: Pat
     assert hats @ up == pytest.approx(contact.force[-1, 0, 1], rel=1e-6)  # single precision
     assert getattr(Image.open(tmp_path / "move.gif"), "n_frames", 1) > 2
     assert (tmp_path / "contact.png").stat().st_size > 5000
+    disc = "obstacle=[{kind='disc', center=[0.5, -0.53], radius=0.5}]"  # touched by fewer than 1 % of the nodes
+    fine = [*SCENE, disc, "tissue.cells=[20, 40]", "time.steps=40", "output.frames=3"]
+    if importlib.util.find_spec("pyvista"):
+        run_simulate(Path("paper_forward"), tmp_path / "fine", fine, console, pictures=False)
+        assert Move(tmp_path / "fine", "contact_traction").range[1] > 0
 
 
 def test_pictures_show_obstacles_where_they_are() -> None:

@@ -16,7 +16,6 @@ rounds on the small problem alone. A two-way hand feels N_s'x, N_s = N T.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,12 +26,13 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.surface import make_surface
 from softgrasp.fem.obstacles import HalfSpace, make_obstacles
-from softgrasp.fem.obstacles.obstacle import check_passage, mean_normal
+from softgrasp.fem.obstacles.obstacle import Obstacle, check_passage, mean_normal
 from softgrasp.fem.obstacles.responses import Responses
 from softgrasp.fem.obstacles.small import SmallProblem
 from softgrasp.fem.petsc import Array, rows_on_all, total
-from softgrasp.fem.run.contact_impulse import stopping_impulse
-from softgrasp.fem.run.contact_record import ContactRecord, Tables
+from softgrasp.fem.run.contact.impulse import stopping_impulse
+from softgrasp.fem.run.contact.record import ContactRecord, Tables
+from softgrasp.fem.run.contact.rows import Flags, Ints, Rows
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive
@@ -41,18 +41,6 @@ ROUNDING = 64 * float(np.finfo(float).eps)  # of a gap, over the coordinates it 
 STILL = 1e-12  # normal velocity of pressed nodes over the largest velocity on the boundary, which is rounding [1]
 MOST = 200  # rounds of a step
 STRAIGHT = 1e-8  # motion of a node over the size of the body below which its normal does not turn [1]
-Ints = NDArray[np.intp]
-Flags = NDArray[np.bool_]
-
-
-@dataclass
-class Rows:
-    """Contact rows of a step: a boundary node before an obstacle each, with its force."""
-
-    obstacle: Ints  # number of the obstacle, (k,)
-    node: Ints  # number of the boundary node, (k,)
-    normal: Array  # mean normal of the step, (k, d)
-    x: Array  # force [N], (k,)
 
 
 def unsettled(reached: float) -> SolverError:
@@ -100,7 +88,7 @@ class Contact:
         self.room = system.M_ee.createVecs()
 
     def _make_responses(self) -> Responses:
-        bases = [o.shape.normal[None] if isinstance(o.shape, HalfSpace) else np.eye(self.d) for o in self.obstacles]
+        bases = [self._basis(o) for o in self.obstacles]
         directions = np.unique(np.vstack(bases), axis=0)
         self.numbers = [[int(np.flatnonzero((directions == n).all(axis=1))[0]) for n in basis] for basis in bases]
         self.b, self.y, reach = self.midpoint.r.duplicate(), self.midpoint.w.duplicate(), None
@@ -108,6 +96,10 @@ class Contact:
             self.Y = np.column_stack([self._take(column) for column in self.midpoint.Y.T])
             reach = self.surface.T - self.hand.theta * self.Y, self.hand.inverse / self.s**2
         return Responses(directions, self._respond, self.p * self.d, reach)
+
+    def _basis(self, obstacle: Obstacle) -> Array:
+        """Directions in which the nodes that an obstacle presses have responses, (m, d)."""
+        return obstacle.shape.normal[None] if isinstance(obstacle.shape, HalfSpace) else np.eye(self.d)
 
     def _respond(self, force: Array) -> tuple[Array, Array]:
         """S^-1 of forces on the boundary. Collective."""
@@ -171,7 +163,7 @@ class Contact:
         f, self.rows = self._settle(n, x0, x1)
         self._add(n, f, drive)
         rows, table = self.rows, self.table
-        np.add.at(table.force[n], rows.obstacle, rows.x[:, None] * rows.normal)
+        np.add.at(table.force[n], rows.obstacle, rows.forces())
         np.add.at(table.touching[n], rows.obstacle, 1)
         table.hand[n] = self.surface.T.T @ self.forces
         table.energy[:2] += 2 * self.forces @ self.moved, rows.x @ self.gaps[rows.obstacle, rows.node]
@@ -192,7 +184,7 @@ class Contact:
             reached = np.abs(after[rows.obstacle, rows.node])[pressed].max(initial=0.0)
             if not new.any() and reached <= tol:
                 self.after = after
-                return f, Rows(rows.obstacle[pressed], rows.node[pressed], rows.normal[pressed], rows.x[pressed])
+                return f, rows.take(pressed)
             known |= new
             active[:] = False
             active[rows.obstacle[pressed], rows.node[pressed]] = True
@@ -212,6 +204,16 @@ class Contact:
     ) -> tuple[Array, Rows]:
         """Forces with the mean normals between x0 and x1. Collective."""
         rows = self._make_rows(np.argwhere(known))
+        q = self._look_along(rows, n, x0, free, x1)
+        C = self.select(self.responses, np.argwhere(known), rows.normal)
+        m = C.shape[1]
+        W = C @ self.responses.G[:m, :m] @ C.T
+        self.small.restart(W, np.flatnonzero(active[rows.obstacle, rows.node]))
+        rows.x = self.small.solve(len(q), W, q, tol / 4).copy()
+        return C.T @ rows.x, rows
+
+    def _look_along(self, rows: Rows, n: int, x0: Array, free: Array, x1: Array) -> Array:
+        """Set the mean normals of rows between x0 and x1; half their gaps at the free end, (k,) [m]."""
         q = self.after[rows.obstacle, rows.node] / 2
         for o, obstacle in enumerate(self.obstacles):
             mine = np.flatnonzero(rows.obstacle == o)
@@ -224,12 +226,7 @@ class Contact:
             rows.normal[mine] = normal
             q[mine] = self.gaps[o, i] / 2
             q[mine] += np.einsum("ij,ij->i", normal, free[i] - obstacle.shift((n + 1) * self.dt) - begin) / 2
-        C = self.select(self.responses, np.argwhere(known), rows.normal)
-        m = C.shape[1]
-        W = C @ self.responses.G[:m, :m] @ C.T
-        self.small.restart(W, np.flatnonzero(active[rows.obstacle, rows.node]))
-        rows.x = self.small.solve(len(q), W, q, tol / 4).copy()
-        return C.T @ rows.x, rows
+        return q
 
     def select(self, responses: Responses, pairs: Ints, normal: Array) -> Array:
         """Shares (k, m) of all responses in unit forces along normals (k, d) of pairs of obstacle and node, (k, 2).
@@ -294,8 +291,10 @@ class Contact:
             normal[mine] = obstacle.normal(x[mine], n * self.dt)
             v[mine] -= obstacle.rate(n * self.dt)
         self.fastest = max(self.fastest, float(np.abs(v).max()))
+        rows, normal, v = self._held_back(rows, normal, v)
         b = -np.einsum("ij,ij->i", normal, v)
-        if np.abs(b).max() > STILL * self.fastest:
+        # slower than the rounding of a place in half a step is at rest
+        if np.abs(b).max() > max(STILL * self.fastest, self.s * self.tolerance(x)):
             self._strike(state, n, rows, normal, b)
 
     def _strike(self, state: TissueState, n: int, rows: Rows, normal: Array, b: Array) -> None:
@@ -327,6 +326,10 @@ class Contact:
         table.energy[0] += sums[-2]
         table.energy[2] += sums[-1] + momentum[rows:] @ hand / 2
 
+    def _held_back(self, rows: Rows, normal: Array, v: Array) -> tuple[Rows, Array, Array]:
+        """Rows that stop at the end of a step, with their directions and velocities (k, d), from those pressed."""
+        return rows, normal, v
+
     # ---- what is left of a run
 
     def pressing(self) -> Array:
@@ -352,11 +355,11 @@ class Contact:
     def record(self) -> ContactRecord:
         """The record of the run."""
         table = self.table
-        work, touch, stopped = table.energy.tolist()
+        work, touch, stopped, rubbed = table.energy.tolist()
         names = tuple(o.name for o in self.obstacles)
         return ContactRecord(
-            names, table.force, table.impulse, table.gap, table.touching, work, touch, stopped, self.small.rounds,
-            self.responses.count, self.p,
+            names, table.force, table.impulse, table.gap, table.touching, work, touch, stopped, rubbed,
+            self.small.rounds, self.responses.count, self.p,
         )  # fmt: skip
 
     def restart_arrays(self) -> dict[str, Array]:

@@ -31,6 +31,8 @@ class ContactRecord:
     """Energy dissipated in the steps of first touch, >= 0 [J]."""
     stopped: float
     """Kinetic energy dissipated by the impulses, >= 0 [J]."""
+    rubbed: float
+    """Energy dissipated by friction, >= 0 [J]."""
     rounds: int
     """Rounds of all contact problems [1]."""
     columns: int
@@ -62,7 +64,7 @@ class Tables:
     touching: Array  # numbers of pressed nodes, (steps, obstacles)
     hand: Array  # force of the contact in the freedoms of the hand, impulses included, (steps, n_s) [N, N m]
     kick: Array  # G'u for the jump u of the velocity by each impulse, (steps, n_s) [N s, N m s]
-    energy: Array  # work, and energy dissipated at first touch and by impulses, (3,) [J]
+    energy: Array  # work, and energy dissipated at first touch, by impulses and by friction, (4,) [J]
 
     @staticmethod
     def empty(steps: int, obstacles: int, d: int, n_s: int) -> Tables:
@@ -70,7 +72,7 @@ class Tables:
         force, impulse = np.zeros((2, steps, obstacles, d))
         hand, kick = np.zeros((2, steps, n_s))
         return Tables(
-            force, impulse, np.zeros((steps + 1, obstacles)), np.zeros((steps, obstacles)), hand, kick, np.zeros(3)
+            force, impulse, np.zeros((steps + 1, obstacles)), np.zeros((steps, obstacles)), hand, kick, np.zeros(4)
         )
 
     def _tables(self) -> tuple[Array, ...]:

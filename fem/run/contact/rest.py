@@ -20,7 +20,7 @@ from softgrasp.fem.solve.statics import equilibrium
 from softgrasp.fem.solve.stiffness import factored_stiffness
 
 if TYPE_CHECKING:
-    from softgrasp.fem.run.contact import Contact
+    from softgrasp.fem.run.contact.general import Contact
 
 MOST = 100  # rounds
 

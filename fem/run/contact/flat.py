@@ -16,7 +16,8 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles import HalfSpace
 from softgrasp.fem.obstacles.compiled import contact_library
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.contact import MOST, ROUNDING, STILL, Contact, Ints, Rows, unsettled
+from softgrasp.fem.run.contact.general import MOST, ROUNDING, STILL, Contact, unsettled
+from softgrasp.fem.run.contact.rows import Ints, Rows
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive
@@ -26,7 +27,7 @@ KINDS = {np.dtype(float): "double[]", np.dtype(np.intc): "int[]", np.dtype(bool)
 
 
 class FlatContact(Contact):
-    """Contact of one run with half-spaces, see :class:`softgrasp.fem.run.contact.Contact`; there must be a compiler."""
+    """`Contact` of one run with half-spaces; there must be a compiler."""
 
     def __init__(self, model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> None:
         super().__init__(model, midpoint, steps, hand)
@@ -88,7 +89,8 @@ class FlatContact(Contact):
         if not self.f.whole:
             self.moved[:] = self._take(self.midpoint.w_array)
         self.q[:] = self.drive.q[n + 1]
-        return ROUNDING * (float(self.c.softgrasp_look(self.f)) + self.layout.extent)
+        self.tol = ROUNDING * (float(self.c.softgrasp_look(self.f)) + self.layout.extent)
+        return self.tol
 
     def press(self, n: int, drive: TableDrive | ForceDrive) -> None:
         """See :meth:`Contact.press`. Collective."""
@@ -164,7 +166,7 @@ class FlatContact(Contact):
         self.reached[0] = self.fastest
         most = self.c.softgrasp_rates(self.f, self.reached)
         self.fastest = self.reached[0]
-        if most > STILL * self.fastest:
+        if most > max(STILL * self.fastest, self.s * self.tol):
             rows = self._pressed_rows()
             self._strike(state, n, rows, rows.normal, self.stops[: len(rows.node)])
 

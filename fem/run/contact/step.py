@@ -5,8 +5,8 @@ from __future__ import annotations
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles.compiled import contact_library
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.contact import Contact
-from softgrasp.fem.run.contact_flat import FlatContact
+from softgrasp.fem.run.contact.flat import FlatContact
+from softgrasp.fem.run.contact.general import Contact
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive
 
@@ -64,8 +64,14 @@ def make_contact(
     """
     assert isinstance(midpoint, ContactMidpoint)
     hand = drive.step if isinstance(drive, ForceDrive) and model.system.two_way else None
-    shapes = {entry.kind for entry in model.scene.obstacle or []}
-    kind: type[Contact] = FlatContact if shapes == {"halfspace"} and contact_library() is not None else Contact
+    obstacles = model.scene.obstacle or []
+    kind: type[Contact] = Contact
+    if any(entry.friction for entry in obstacles):
+        from softgrasp.fem.run.contact.friction import FrictionContact  # only scenes with friction pay for it
+
+        kind = FrictionContact
+    elif {entry.kind for entry in obstacles} == {"halfspace"} and contact_library() is not None:
+        kind = FlatContact
     midpoint.contact = kind(model, midpoint, steps, hand)
     if isinstance(drive, TableDrive):
         midpoint.contact.check_hand(drive, 0, steps + 1)
