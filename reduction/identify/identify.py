@@ -29,7 +29,7 @@ from softgrasp.reduction.identify.result import Identified
 from softgrasp.reduction.identify.unknowns import assumed, parse_unknowns, scene_at, value_of
 from softgrasp.reduction.identify.verdict import judge, reasons, unseen, warnings
 
-GROWTH, LARGEST_N = 1.5, 80  # of N while the reduction exceeds the noise
+GROWTH, LARGEST_N = 1.5, 200  # of N while the reduction exceeds the noise
 MOST_REFINED = 3  # times that a mesh is refined
 Data = Measurements | str | Path
 
@@ -143,10 +143,11 @@ def _identify(
                 name: None if error is None else line.inverse @ found.misfit.together(error, found.p)
                 for name, error in errors.items()
             }
+            most = min(LARGEST_N, model.states)
             lost, noise = parts["reduction"], np.sqrt(np.diag(line.covariance))
-            if lost is None or (np.abs(lost) <= noise).all() or N * GROWTH > LARGEST_N:
+            if lost is None or (np.abs(lost) <= noise).all() or most < N * GROWTH:
                 break
-            N, start = int(np.ceil(N * GROWTH)), found.p
+            N, start = 2 * int(np.ceil(N * GROWTH / 2)), found.p  # modes come in pairs of states
     return _answer(found, line, first, parts, estimate, N, robust)
 
 

@@ -165,3 +165,11 @@ def test_what_cannot_be_fitted_is_refused_in_a_sentence() -> None:
         sg.identify(graded, [], "mu", 1e-3)
     with pytest.raises(SceneError, match="the scene has 2 outputs"):
         sg.identify(graded, Measurements("a", measured.times, measured.values[:, :1]), "mu", 1e-3)
+
+
+def test_reduced_models_grow_until_the_noise_hides_them() -> None:
+    keys = [*GRADED, "time.steps=1200"]
+    small = sg.identify(model(*keys), data(1e-3), "mu,beta", 1e-3, N=10)
+    assert small.N > 10
+    assert small.N % 2 == 0
+    assert (np.abs(small.parts["reduction"]) <= small.noise).all()

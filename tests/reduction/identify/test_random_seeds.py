@@ -1,4 +1,4 @@
-"""Is the truth within twice the stated errors? Random noise on data of finer models, in 2D, in 3D and in layers."""
+"""Is the truth within twice the stated errors? Random noise on data of a finer model."""
 
 from __future__ import annotations
 
@@ -22,13 +22,6 @@ SCENES: dict[str, tuple[str, list[str], list[str], dict[str, float], float, int]
          "tissue.refine.tolerance=1e-2"],
         ["tissue.refine.tolerance=1e-3", "time.steps=2400"],
         {"mu": 1.6, "lambda": 1.2, "beta": 1.5}, 1e-3, 4,
-    ),
-    "3D": (
-        "block_3d", [], ["tissue.cells=[7, 5, 12]", "time.steps=800"], {"mu": 1.3, "beta": 1.4}, 2e-4, 4,
-    ),
-    "layers": (
-        "layers_2d", [], ["tissue.cells=[45, 22]", "tissue.order=3", "time.steps=1600"],
-        {"fat.mu": 1.4, "fat.beta": 1.3}, 5e-6, 8,
     ),
 }  # fmt: skip
 
