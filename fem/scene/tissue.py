@@ -249,7 +249,7 @@ class Contact(Section):
         default_factory=list,
         description="planes of the bounding box [no unit]: x- to z+, left, right, bottom, top, front, back",
     )
-    box: Box | None = Field(None, description="[[lo], [hi]] [m]; facets whose midpoint lies inside")
+    box: Dropped[Box] = Field(None, description="[[lo], [hi]] [m]; facets whose midpoint lies inside")
     facet_tag: int | str | None = Field(
         None, description="facet tag, or name of a facet set, in the mesh file [no unit]"
     )

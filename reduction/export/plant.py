@@ -9,16 +9,20 @@ from pathlib import Path
 import numpy as np
 
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.reduced import midpoint_map
 from softgrasp.reduction.export.affine import AffinePlant, Label, affine_plant
 from softgrasp.reduction.export.c import CODE, array, code_of, comment, hexadecimal, write_files
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import Stepper
-from softgrasp.reduction.system import UnstableModelError
+from softgrasp.reduction.system import EnergySystem, UnstableModelError
 
+EPS = float(np.finfo(float).eps)
 GOLDEN_STEPS = 200  # of the log, with each of two materials
 OTHER = (1.3, 1.3, 0.7)  # times mu, lambda, beta: the second of them
-DIGITS = 1e-13  # of the largest output of the same unit: our stepper repeats the rounding of its matrix every step
-TURNED = 1e-11  # where nothing damps: its rotations are rounded to a length of 1, which turns them by 1e-12 at most
+# Least tolerance of the test, of the largest output of the same unit: our stepper repeats the rounding of its matrix
+# every step, and where nothing damps it rounds its rotations to a length of 1.
+DIGITS, TURNED = 1e-13, 1e-11
+ROUNDINGS = 4.0  # times the change by one rounding of each entry, with signs at random
 
 
 def write_c(model: ReducedModel, folder: str | Path, tick: float = 1e-3) -> list[Path]:
@@ -96,14 +100,34 @@ def golden_log(model: ReducedModel, plant: AffinePlant) -> str:
         parts.append((f"material {hexadecimal(theta)}", _march(stepper, u[GOLDEN_STEPS:])))
     most = np.abs(np.concatenate([y for _, y in parts])).max(axis=0)
     units = [label.unit for label in plant.outputs]
-    scale = np.array([max(most[j] for j, other in enumerate(units) if other == unit) for unit in units])
-    tolerance = TURNED if model.at().structured else DIGITS
-    lines = [f"tolerance {tolerance.hex()}", f"scale {hexadecimal(np.where(scale > 0, scale, 1.0))}"]
+    scale = np.array([max(most[j] for j, same in enumerate(units) if same == unit) for unit in units])
+    scale = np.where(scale > 0, scale, 1.0)
+    systems = [model.at(m) for m in (model.materials, other)[: len(parts)]]
+    plain, rounded = (_midpoint(systems, plant, u, rounded) / scale for rounded in (False, True))
+    own = np.vstack([y for _, y in parts]) / scale if model.at().structured else plain
+    tolerance = max(TURNED if model.at().structured else DIGITS,
+                    ROUNDINGS * (np.abs(rounded - plain).max() + np.abs(own - plain).max()))  # fmt: skip
+    lines = [f"tolerance {tolerance.hex()}", f"scale {hexadecimal(scale)}"]
     for i, (head, y) in enumerate(parts):
         lines.append(head)
         rows = u[i * GOLDEN_STEPS :]
         lines += [f"tick {hexadecimal(row)} {hexadecimal(values)}" for row, values in zip(rows, y, strict=False)]
     return "\n".join([*lines, ""])
+
+
+def _midpoint(systems: list[EnergySystem], plant: AffinePlant, u: Array, rounded: bool) -> Array:
+    """The outputs of the log by the plain midpoint rule; ``rounded``: with each entry of E and A changed by eps."""
+    rng = np.random.default_rng(0)
+    x, rows = plant.d * plant.start, []
+    for i, system in enumerate(systems):
+        signs = (rounded * EPS * rng.choice([-1.0, 1.0], system.E.shape) for _ in range(2))
+        E, A = (M * (1 + s) for M, s in zip((system.E, system.A), signs, strict=True))
+        step = midpoint_map(E, A, np.column_stack([system.B, system.f]), plant.tick)
+        read = np.vstack([system.S_q, system.S_v, system.C])
+        for row in u[i * GOLDEN_STEPS : (i + 1) * GOLDEN_STEPS]:
+            x = step @ np.concatenate([x, row, [1.0]])
+            rows.append(read @ x)
+    return np.array(rows)
 
 
 def _march(stepper: Stepper, u: Array) -> Array:

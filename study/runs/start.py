@@ -134,6 +134,7 @@ def _layer_tables(arrays: MeshArrays) -> str:
     tables = []
     for name in groups:
         key = name if isinstance(name, str) else f"tag{name}"
+        key = "tissue_group" if key == "tissue" else key  # that name is of the cells outside of all layers
         material = str(name).lower() if str(name).lower() in LIBRARY else "muscle"
         tables.append(f'\n[tissue.layers.{json.dumps(key)}]\ntag = {json.dumps(name)}\nmaterial = "{material}"\n')
     return "".join(tables)

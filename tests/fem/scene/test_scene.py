@@ -236,6 +236,8 @@ def test_set_takes_toml_values_bare_words_indices_and_false() -> None:
     assert load_scene(FRANKA, ["effects.damping=false"]).effects.damping is None
     tissue = load_scene(PAPER, ["tissue.mesh=a.msh", "tissue.size=false", "tissue.cells=false"]).tissue
     assert (tissue.size, tissue.cells, tissue.mesh) == (None, None, "a.msh")
+    contact = load_scene(PILLOW, ["contact.box=false", "contact.facet_tag=7"]).contact
+    assert (contact.box, contact.facet_tag) == (None, 7)
 
 
 def test_sides_by_dimension() -> None:
