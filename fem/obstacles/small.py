@@ -63,13 +63,16 @@ class SmallProblem:
             )  # fmt: skip
 
     def restart(self, W: Array, active: Array) -> None:
-        """Begin from a set of another W, whose factor is made anew."""
+        """Begin from a set of another W, whose factor is made anew, or from none where rounding leaves it without."""
         self.count[0] = 0
         self.fit(len(W))
         rows = np.sort(active)
         block = W[np.ix_(rows, rows)]
         block[np.diag_indices(len(rows))] *= 1 + RIDGE
-        self.L[: len(rows), : len(rows)] = np.linalg.cholesky(block)
+        try:
+            self.L[: len(rows), : len(rows)] = np.linalg.cholesky(block)
+        except np.linalg.LinAlgError:
+            return
         self.order[: len(rows)], self.count[0] = rows, len(rows)
 
     def resume(self, order: Array, L: Array, size: int) -> None:
@@ -90,7 +93,7 @@ class SmallProblem:
         if failed:
             raise SolverError(
                 f"the contact problem of {p} rows has no solution that {MOST * p} rounds find; obstacles that "
-                "leave the tissue no room are the usual reason: move one, or take smaller steps"
+                "leave the tissue no room are the usual reason: move one, or take more time.steps"
             )
         return self.x[:p]
 

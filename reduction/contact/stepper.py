@@ -6,7 +6,7 @@ With s = 2/dt and gaps g = N a + g_s that the hand's motion and the obstacles' s
     q = g_s,n+1 / 2 + N (a_n / 2 + w_0),   W = N S^-1 N',   w = w_0 + S^-1 N'x,
     a_n+1 = a_n + 2 w,   v_n+1 = 2 s w - v_n + N'y,   (N N')_AA y = -(N v + g_s')_A on the pressed rows A.
 
-It is the step of the full model (`fem/run/contact.py`) on the span of V, so that the same holds: no kept node is in an
+It is the step of the full model (`fem/run/contact`) on the span of V, so that the same holds: no kept node is in an
 obstacle at the end of a step, and the balance of energy closes to rounding. `stepper.c` runs all steps; without a
 compiler NumPy runs the same ones.
 """

@@ -107,4 +107,5 @@ class FrictionContact(Contact):
     def _resume(self, sets: list[Array]) -> None:
         """See :meth:`Contact._resume`. Collective."""
         super()._resume(sets)
+        self.coulomb.rounds = self.small.rounds
         self.rows.kind = sets[1].astype(np.int8)

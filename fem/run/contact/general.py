@@ -46,8 +46,8 @@ STRAIGHT = 1e-8  # motion of a node over the size of the body below which its no
 def unsettled(reached: float) -> SolverError:
     """The error of a step whose rounds leave a gap [m]."""
     return SolverError(
-        f"contact: {MOST} rounds leave a gap of {reached:.2g} m at pressed nodes; take more time.steps, or an "
-        "obstacle that is large against the cells"
+        f"contact: {MOST} rounds leave a gap of {reached:.2g} m at pressed nodes; obstacles that leave the tissue no "
+        "room, or are small against the cells, are the usual reason: move one, take smaller cells or more time.steps"
     )
 
 

@@ -80,6 +80,8 @@ def test_obstacles_follow_their_paths(moved: Scene) -> None:
     assert table.gap(x, 1.0) == pytest.approx([0.3, -0.45], rel=1e-14)  # the table's row at 1 s: up by 0.5
     slow = (table.gap(x, 1e-4) - table.gap(x, 0.0)) / 1e-4
     assert abs(slow).max() < 1e-3  # at rest at the start: a quadratic beginning
+    assert np.array_equal(table.gap(x, 5.0), table.gap(x, 3.0))  # at rest behind the end of its table
+    assert np.abs(table.rate(5.0)).max() < 1e-15  # rounding of the spline
     assert post.gap(x, 2.0)[1] == 0.5  # at x = 1
     assert post.normal(x, 2.0)[1].tolist() == [-1.0, 0.0]
     assert post.support(np.array([-1.0, 0.0]), 2.0) == -0.5

@@ -69,6 +69,13 @@ def test_equal_rows_share_their_force(equal: int) -> None:
     assert x.sum() == pytest.approx(1.0, abs=1e-11)  # the ridge of 1e-13
 
 
+def test_a_set_without_a_factor_begins_from_none() -> None:
+    W = np.array([[1.0, 1.0 + 1e-9], [1.0 + 1e-9, 1.0]])  # equal rows, by more rounding than the ridge of 1e-13 takes
+    small = SmallProblem()
+    small.restart(W, np.arange(2))
+    assert small.solve(2, W, np.array([-1.0, 0.5]), 1e-12).tolist() == pytest.approx([1.0, 0.0], abs=1e-11)  # the ridge
+
+
 @pytest.mark.ranks(2)
 @pytest.mark.parametrize(
     "overrides",

@@ -127,16 +127,17 @@ def test_every_step_of_friction_takes_energy(monkeypatch: pytest.MonkeyPatch) ->
     assert taken[-1] > 1e-4
 
 
-def test_restart_in_friction_repeats_the_bits(tmp_path: Path) -> None:
+def test_restart_in_friction_repeats_the_bits(mpi_tmp_path: Path) -> None:
     overrides = [*SMALL, BETA, SIDE, table(0.4)]
     whole = simulate(build("paper_forward", overrides))
     with pytest.raises(Paused):
-        simulate(build("paper_forward", overrides), RunOptions(tmp_path, until=70))
-    again = simulate(build("paper_forward", overrides), RunOptions(tmp_path, resume=True))
+        simulate(build("paper_forward", overrides), RunOptions(mpi_tmp_path, until=70))
+    again = simulate(build("paper_forward", overrides), RunOptions(mpi_tmp_path, resume=True))
     assert whole.contact.touching[:70].max() > 0
     assert np.array_equal(again.final, whole.final)
     assert np.array_equal(again.contact.force, whole.contact.force)
     assert again.contact.rubbed == whole.contact.rubbed
+    assert again.contact.rounds == whole.contact.rounds
 
 
 REFUSED = [
