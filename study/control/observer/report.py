@@ -59,7 +59,8 @@ def facts(study: ObservedStudy) -> Iterator[tuple[str, str]]:
     if found.weight > 1:
         yield "noise of what is left out", f"{found.weight:g} times the estimate: with less the full loop is not stable"
     for name, value in found.without.items():
-        yield f"abscissa without {name}", f"{value:.4g} 1/s" + ("" if value < 0 else ": not stable")
+        kept = "with the hand's samples alone" if name == "all but the hand" else f"without {name}"
+        yield f"abscissa {kept}", f"{value:.4g} 1/s" + ("" if value < 0 else ": not stable")
     if found.full is not None and study.sd_nodes is not None:
         solution, (low, middle, high) = found.full.solution, study.sd_nodes
         yield (
