@@ -252,7 +252,7 @@ def _at_rest(design: Design) -> Array:
 
 
 def _limits(design: Design) -> Limits:
-    """Of the scene, one number per axis. Raises ControlError: their number does not fit."""
+    """Of the scene, one number per axis. Raises ControlError: their number does not fit, or the loop cuts them."""
     given, n_s = control_of(design.model).constraints, design.problem.layout.n_s
     assert given is not None
     if given.force is None and given.margin == "bound":
@@ -263,6 +263,12 @@ def _limits(design: Design) -> Limits:
     force = None if given.force is None else np.atleast_1d(np.asarray(given.force, dtype=np.float64))
     if force is not None and len(force) not in (1, n_s):
         raise ControlError(f"control.constraints.force has {len(force)} numbers; give one, or {n_s}, one per axis")
+    bound = design.actuation.bound(n_s)
+    if bound is not None and (force is None or (force > bound).any()):
+        raise ControlError(
+            f"control.loop.limit cuts the forces at {bound.min():.4g} N, and a plan needs all of its own; set "
+            "control.constraints.force to no more than that"
+        )
     return Limits(None if force is None else np.broadcast_to(force, (n_s,)).copy(), given.speed, given.jump)
 
 

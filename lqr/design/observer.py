@@ -8,7 +8,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.model.build import Stopwatch
+from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.scene import control_of
@@ -52,6 +52,20 @@ class ObservedControl:
     """The full plant in them, from tick to tick."""
 
 
+def require_observable(model: Model) -> None:
+    """Raises ControlError: the scene has no observer, whatever its gain."""
+    layout, control = model.system.layout, control_of(model)
+    if layout.n_e > DENSE_LIMIT:
+        raise ControlError(
+            f"an observer is checked with all modes of the plant, at most {DENSE_LIMIT}; this scene has {layout.n_e}: "
+            "take a coarser mesh"
+        )
+    if control.method == "modal":
+        raise ControlError("an observer takes the optimal gain of the whole plant; leave out control.method = 'modal'")
+    if control.loop.delay:
+        raise ControlError("control.loop.delay and an observer exclude each other; give control.observer.delay instead")
+
+
 def observe(design: Design, watch: Stopwatch) -> ObservedControl:
     """Filter, controller and judgement of a scene. Collective.
 
@@ -66,7 +80,7 @@ def observe(design: Design, watch: Stopwatch) -> ObservedControl:
     """
     problem, given, loop_of = design.problem, control_of(design.model).observer, control_of(design.model).loop
     assert given is not None
-    _check(design)
+    require_observable(design.model)
     noise = Noise(given.noise.pose, given.noise.speed, given.noise.marker, given.noise.force)
     sensors = make_sensors(problem, given.markers, noise)
     acting = given.disturbance
@@ -96,20 +110,6 @@ def observe(design: Design, watch: Stopwatch) -> ObservedControl:
             )
         without = on_root(problem.layout.comm, lambda: _without(ticks, controller, sensors))
     return ObservedControl(controller, sensors, reduced, weight, judged, without, full, missing, sd_full, loop, ticks)
-
-
-def _check(design: Design) -> None:
-    """Raises ControlError: the scene has no observer."""
-    layout, loop = design.problem.layout, control_of(design.model).loop
-    if layout.n_e > DENSE_LIMIT:
-        raise ControlError(
-            f"an observer is checked with all modes of the plant, at most {DENSE_LIMIT}; this scene has {layout.n_e}: "
-            "take a coarser mesh"
-        )
-    if design.modal:
-        raise ControlError("an observer takes the optimal gain of the whole plant; leave out control.method = 'modal'")
-    if loop.delay:
-        raise ControlError("control.loop.delay and an observer exclude each other; give control.observer.delay instead")
 
 
 def _controller(design: Design, reduced: ReducedFilter, period: float) -> Controller:

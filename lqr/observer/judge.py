@@ -27,6 +27,8 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 
+TURN = 1.0  # of the fastest mode in a step of Simpson's rule at most [rad]; its error there is a few 1e-4
+
 
 @dataclass(frozen=True)
 class Ticks:
@@ -54,12 +56,20 @@ def make_ticks(
     def make() -> Ticks:
         n, m = loop.B.shape
         G = np.linalg.solve(modes.space.E, force)
-        half = scipy.linalg.expm(period / 2 * np.vstack([np.hstack([loop.A, loop.B]), np.zeros((m, n + m))]))
+        fastest = max(float(modes.omega.max()), float(np.abs(np.diag(modes.D)).max()))
+        halvings = max(0, int(np.ceil(np.log2(fastest * period / TURN))))
+        short = period / 2**halvings
+        half = scipy.linalg.expm(short / 2 * np.vstack([np.hstack([loop.A, loop.B]), np.zeros((m, n + m))]))
         A, B = half[:n, :n], half[:n, n:]
         middle = A @ G
-        # Simpson's rule of the covariance: modes faster than a tick carry little of it
-        W = np.sqrt(period / 6) * np.hstack([G, 2 * middle, A @ middle])
-        return Ticks(A @ A, A @ B + B, C, W, sensors.sd, modes.space.C, period)
+        W = np.sqrt(short / 6) * np.hstack([G, 2 * middle, A @ middle])  # Simpson's rule of the covariance
+        A, B = A @ A, A @ B + B
+        for _ in range(halvings):
+            W = np.hstack([W, A @ W])
+            if W.shape[1] > n:
+                W = np.linalg.qr(W.T, mode="r").T
+            A, B = A @ A, A @ B + B
+        return Ticks(A, B, C, W, sensors.sd, modes.space.C, period)
 
     return on_root(comm, make)
 

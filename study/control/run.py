@@ -65,10 +65,14 @@ def run_control(
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
         plant = linearised(model)
         observed, study = None, cast(GainStudy | None, None)
+        if control_of(model).observer is not None:
+            from softgrasp.lqr.design.observer import require_observable  # no other scene needs it
+
+            require_observable(plant)
         with sharing_factors(plant.system):
             feedback = design(plant, watch, solver_bar(bar, model), restart)
-            if control_of(model).observer is not None:  # first: what has no observer is refused at once
-                from softgrasp.study.control.observer.measure import observed_study  # no other scene needs it
+            if control_of(model).observer is not None:
+                from softgrasp.study.control.observer.measure import observed_study
 
                 observed = observed_study(feedback, watch)
             if gain_only:
@@ -192,9 +196,10 @@ def _drawn(session: Session, study: ControlStudy, frames: Frames) -> Callable[[]
 
 
 def unused_rate(model: Model) -> str:
-    """Says that a rate other than the default does nothing, where the loop is not sampled."""
-    loop = control_of(model).loop
-    if loop.sampling == "held" or loop.rate == Loop().rate:
+    """Says that a rate other than the default does nothing, where neither loop nor observer is sampled."""
+    control = control_of(model)
+    loop = control.loop
+    if loop.sampling == "held" or loop.rate == Loop().rate or control.observer is not None:
         return ""
     return f"control.loop.rate = {loop.rate:g} Hz has no effect: set control.loop.sampling = 'held' to sample the loop"
 

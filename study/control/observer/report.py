@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from softgrasp.fem.shown import counted
 from softgrasp.study.control.observer.result import ObservedStudy
 from softgrasp.study.report.document import Section, listed
 
@@ -47,19 +48,20 @@ def facts(study: ObservedStudy) -> Iterator[tuple[str, str]]:
     """Label and text."""
     found, filter_ = study.observed, study.observed.reduced.filter
     markers, late = len(found.sensors.nodes), filter_.delay
-    kinds = [f"{markers} markers"] * (markers > 0) + ["the force on the hand"] * (
+    kinds = [counted(markers, "marker")] * (markers > 0) + ["the force on the hand"] * (
         len(found.sensors.sd) > found.sensors.markers.stop
     )
     yield "measured", listed(["the hand's velocity and pose" if filter_.speed else "the hand's pose", *kinds])
     yield (
         "samples",
         f"{len(filter_.names)} a tick of {1e3 * found.controller.period:g} ms"
-        + (f", {late} ticks late" if late else ""),
+        + (f", {counted(late, 'tick')} late" if late else ""),
     )
     if found.weight > 1:
         yield "noise of what is left out", f"{found.weight:g} times the estimate: with less the full loop is not stable"
     for name, value in found.without.items():
-        yield f"abscissa without {name}", f"{value:.4g} 1/s" + ("" if value < 0 else ": not stable")
+        kept = "with the hand's samples alone" if name == "all but the hand" else f"without {name}"
+        yield f"abscissa {kept}", f"{value:.4g} 1/s" + ("" if value < 0 else ": not stable")
     if found.full is not None and study.sd_nodes is not None:
         solution, (low, middle, high) = found.full.solution, study.sd_nodes
         yield (

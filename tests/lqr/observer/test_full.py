@@ -8,7 +8,7 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
-from softgrasp.fem.petsc import rows_on_all
+from softgrasp.fem.petsc import rows_on_all, total
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.observer.full import FullFilter, full_filter
@@ -37,12 +37,13 @@ def test_gain_is_that_of_the_dense_filter_of_all_modes(overrides: list[str]) -> 
     modes = ModalLoop(problem, DENSE_LIMIT).plant
     n, w = len(modes.omega), modes.omega
     A = np.block([[np.zeros((n, n)), np.diag(w)], [-np.diag(w), -modes.D]])  # of [omega eta, eta']
-    C = np.hstack([sensors.of(modes.Phi)[0][sensors.markers] / w, np.zeros((8, n))])
-    F = np.vstack([np.zeros((n, 4)), modes.Phi.T @ np.hstack([problem.system.G, disturbance.p])])
+    comm = problem.layout.comm
+    C = np.hstack([total(comm, sensors.of(modes.Phi)[0])[sensors.markers] / w, np.zeros((8, n))])
+    F = np.vstack([np.zeros((n, 4)), total(comm, modes.Phi.T @ np.hstack([problem.system.G, disturbance.p]))])
     V = np.eye(8) * 1e-6 * TICK
     S = scipy.linalg.solve_continuous_are(A.T, C.T, F @ disturbance.W @ F.T, V)
     exact = S @ C.T @ np.linalg.inv(V)
-    gain = np.vstack([w[:, None] * (modes.massed.T @ found.L_1), modes.Phi.T @ found.L_2])
+    gain = np.vstack([w[:, None] * total(comm, modes.massed.T @ found.L_1), total(comm, modes.Phi.T @ found.L_2)])
     # the residual 1e-10 of the equation through its condition
     assert np.abs(gain - exact).max() < 1e-8 * np.abs(exact).max()
     tip = modes.c / w

@@ -469,3 +469,5 @@ def test_a_rate_without_sampling_is_said_to_do_nothing() -> None:
         note = unused_rate(build(make_scene({"control": {**base, "loop": loop}})))
         assert bool(note) == said
         assert not said or "control.loop.rate = 2 Hz has no effect" in note
+    ticking = {"loop": {"rate": 2.0}, "observer": {"markers": [[0.0, 0.0]]}}
+    assert not unused_rate(build(make_scene({"control": {**base, **ticking}})))

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.lqr.loop.controller import Controller
+from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.study.control.run import run_control
 
 SMALL = ["tissue.cells=[4,8]", "control.N=[8]", "output.fields='none'", "output.frames=2"]
@@ -60,6 +61,14 @@ def test_tables_that_are_no_observer_are_refused(override: str, sentence: str, t
     with pytest.raises(SceneError) as error:
         control(tmp_path, override)
     assert sentence in str(error.value)
+
+
+def test_what_has_no_observer_is_refused_before_the_riccati_equation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("softgrasp.study.control.run.design", lambda *_: pytest.fail("the equation was solved"))
+    with pytest.raises(ControlError, match="at most 1300; this scene has"):
+        control(tmp_path, OBSERVER, "tissue.cells=[30,60]")
 
 
 def test_a_scene_without_the_table_imports_no_observer_and_keeps_its_bits(tmp_path: Path) -> None:

@@ -94,6 +94,7 @@ def test_plan_of_the_linear_plant_runs_at_finite_strain(tmp_path: Path) -> None:
     [
         ("control.constraints.force=false", "control.constraints.force"),
         ("control.constraints.force=[1.0, 1.0, 1.0]", "force has 3 numbers; give one, or 2, one per axis"),
+        ("control.loop.limit=2.0", "control.loop.limit cuts the forces at 2 N"),
         ("obstacle.1.offset=-5.99", "at the target the gap to obstacle wall is -0.01 m"),
         ("obstacle.0.path={velocity=[0.1, 0.0]}", "obstacle.0.path moves obstacle disc"),
         ("effects.reaction=true", "a plan past obstacles is made for a hand that neither turns nor feels the tissue"),
