@@ -120,7 +120,7 @@ def test_outliers_missing_samples_places_and_clocks_are_modelled() -> None:
     # the file's clock is late, so that its times less 13 ms are those of the hand
     assert abs(late + 0.013) < 4 * dt
     assert found.residuals.outliers > 10
-    assert sg.identify(coarse, measured, **{**fit, "fit": "mu"}).reasons[0].startswith("The misfit is")
+    assert sg.identify(coarse, measured, offset=True, shift=True, **fit).reasons[0].startswith("The misfit is")
 
 
 def test_a_measured_hand_takes_the_place_of_the_scene_s() -> None:
