@@ -87,8 +87,8 @@ def listed(names: Iterable[str], most: int = 6) -> str:
     return ", ".join(shown) or "none"
 
 
-def percent(share: float) -> str:
-    """A share as a percentage of two digits; "> 9999 %" also where it is not finite."""
-    if not share < 100:
-        return "> 9999 %"
-    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
+def percent(share: float, sign: str = "") -> str:
+    """A share as a percentage of two digits, "+" with its sign; "> 9999 %" also where it is not finite."""
+    if not abs(share) < 100:
+        return "< -9999 %" if share < 0 else "> 9999 %"
+    return f"{100 * share:{sign}{'.2g' if abs(share) < 0.995 else '.0f'}} %"

@@ -36,7 +36,7 @@ softgrasp reduce paper_forward --tolerance 1e-2
 0: done, also where --until stopped a run. 1: refused or failed, with one sentence.
 
 2: a wrong option, or a fault of the program. 3: an answer is refused: of query above its
-tolerance, of identify by misfit, mesh, time step or an unseen direction."""
+tolerance, of identify by misfit, mesh, time step, an unseen direction or no convergence."""
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
@@ -292,12 +292,12 @@ def identify(
     data: Annotated[
         list[Path],
         typer.Argument(
-            help="CSV files, an experiment each: time [s], outputs as tip_x [m], perhaps the hand as q_x [m]"
+            help="CSV files, an experiment each: columns time, outputs as tip_x, perhaps the hand as q_x; s and m"
         ),
     ],
     fit: Annotated[str, typer.Option(help="parameters: mu, lambda, rho, beta; of a layer as skin.mu; with commas")],
     noise: Annotated[
-        str, typer.Option(help="standard deviation of the measured numbers [m]: 1e-3, or tip=1e-3,mid_x=2e-3")
+        str, typer.Option(help="standard deviation of the measured numbers, in m: 1e-3, or tip=1e-3,mid_x=2e-3")
     ],
     offset: Annotated[bool, typer.Option("--offset", help="fit a constant error of each output too")] = False,
     shift: Annotated[bool, typer.Option("--shift", help="fit a time shift between hand and outputs too")] = False,
@@ -315,7 +315,7 @@ def identify(
     The error has parts by noise, mesh, time step and reduction. fitted.toml is the scene with the values.
 
     Refused, with exit status 3: a misfit beyond chance, a mesh or time step that changes a value by more than the noise
-    (--refine mends both), a direction that the data do not see.
+    (--refine mends both), a direction that the data do not see, a fit that does not converge.
 
     Example: softgrasp identify my.toml camera.csv --fit mu,lambda,beta --noise 1e-3
     """

@@ -12,7 +12,7 @@ from PIL import Image
 
 import softgrasp as sg
 from softgrasp.fem.errors import SceneError, SoftgraspError
-from softgrasp.fem.shown import Shown
+from softgrasp.fem.shown import Shown, percent
 from softgrasp.lqr.loop.margins import loop_margins
 
 pytestmark = pytest.mark.serial
@@ -165,3 +165,10 @@ def test_a_missing_package_is_named(objects: dict[str, Any], monkeypatch: pytest
     monkeypatch.setitem(__import__("sys").modules, "xarray", None)
     with pytest.raises(SoftgraspError, match=r"xarray is not installed; `pip install 'softgrasp\[data\]'`"):
         objects["run"].to_xarray()
+
+
+def test_percentages_have_two_digits_and_a_sign_on_request() -> None:
+    assert [percent(x) for x in (0.0037, -0.054, 0.999, -1.55, 200.0, -200.0, float("nan"))] == [
+        "0.37 %", "-5.4 %", "100 %", "-155 %", "> 9999 %", "< -9999 %", "> 9999 %",
+    ]  # fmt: skip
+    assert [percent(x, "+") for x in (0.0037, -0.054, 5.3)] == ["+0.37 %", "-5.4 %", "+530 %"]

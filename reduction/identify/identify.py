@@ -50,7 +50,7 @@ def identify(
     """Values (mu, lambda, ..) = argmin sum |y_N(t) - y|^2 / sigma^2 [BCL99], and their errors by cause. Collective.
 
     The answer says by ``reasons`` why it must not be used: a misfit beyond chance, a mesh or a time step that changes a
-    value by more than the noise, a direction that the data do not see.
+    value by more than the noise, a direction that the data do not see, rounds that do not settle.
 
     >>> import numpy as np, softgrasp as sg
     >>> from softgrasp.reduction.identify.data import Measurements
@@ -78,7 +78,7 @@ def identify(
 
     Raises:
         SceneError: data or scene cannot be fitted, in one sentence.
-        SolverError: the fit does not converge, or a solve fails.
+        SolverError: a solve fails.
     """
     check_identifiable(model)
     columns = tuple(c for o in model.outputs for c in o.columns)
@@ -131,7 +131,7 @@ def _identify(
     first = np.array([value_of(model.system.materials, u) for u in unknowns])
     with tempfile.TemporaryDirectory() as folder:
         own = Path(comm.bcast(folder))
-        experiments = [experiment(model, each, own) for each in data]
+        experiments = [experiment(model, each, own / f"hand-{i}.csv") for i, each in enumerate(data)]
         nuisances = Nuisances.of(experiments, offset, shift)
         start = np.concatenate([np.log(first), np.zeros(nuisances.count)])
         while True:
@@ -145,7 +145,7 @@ def _identify(
             }
             most = min(LARGEST_N, model.states)
             lost, noise = parts["reduction"], np.sqrt(np.diag(line.covariance))
-            if lost is None or (np.abs(lost) <= noise).all() or most < N * GROWTH:
+            if found.unsettled or lost is None or (np.abs(lost) <= noise).all() or most < N * GROWTH:
                 break
             N, start = 2 * int(np.ceil(N * GROWTH / 2)), found.p  # modes come in pairs of states
     return _answer(found, line, first, parts, estimate, N, robust)
@@ -171,8 +171,8 @@ def _answer(
         },
         nuisances=_nuisances(misfit.nuisances, found.p[k:], line.all_deviations[k:], data, columns),
         residuals=judged,
-        reasons=reasons(unknowns, judged, unseen(unknowns, line.sizes, line.directions), noise, parts,
-            _cures(parts, noise, estimate, model.scene, N)),
+        reasons=reasons(unknowns, judged, found.unsettled, unseen(unknowns, line.sizes, line.directions), noise,
+            parts, _cures(parts, noise, estimate, model.scene, N)),
         warnings=warnings(judged, robust),
         history=found.history, runs=found.runs, N=N, scene=scene,
         model=replace(model, scene=scene, accuracy=estimate), estimate=estimate, data=data,

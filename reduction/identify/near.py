@@ -70,8 +70,8 @@ class Experiment:
         return self.weights()
 
 
-def experiment(model: Model, data: Measurements, folder: Path) -> Experiment:
-    """The scene of a model under the measured motion, which a table in ``folder`` holds. Collective.
+def experiment(model: Model, data: Measurements, file: Path) -> Experiment:
+    """The scene of a model under the measured motion, which ``file`` holds, of this experiment alone. Collective.
 
     Raises SceneError: the measured motion does not fit.
     """
@@ -82,7 +82,6 @@ def experiment(model: Model, data: Measurements, folder: Path) -> Experiment:
                 f"{data.name}: the scene gives the force on the hand, so its motion q_* cannot be given too"
             )
         times, places = data.hand
-        file = folder / f"{data.name}.hand.csv"
         if system.layout.comm.rank == 0:
             np.savetxt(file, np.column_stack([times, places]), delimiter=",", fmt="%.17g")
         system.layout.comm.Barrier()

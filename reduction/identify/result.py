@@ -10,10 +10,10 @@ from softgrasp.fem.columns import Columns
 from softgrasp.fem.model.build import MeshEstimate, Model
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.shown import Card, Shown
+from softgrasp.fem.shown import Card, Shown, percent
 from softgrasp.reduction.identify.data import Measurements
 from softgrasp.reduction.identify.unknowns import Unknown
-from softgrasp.reduction.identify.verdict import Residuals, percent
+from softgrasp.reduction.identify.verdict import Residuals
 
 
 @dataclass(frozen=True, repr=False)

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import percent
 from softgrasp.reduction.identify.unknowns import Unknown
 
 SIGHT = 1.0  # change of the data per log theta, in sigma, below which a direction is not seen: error above a factor e
 NAMED = 0.3  # of the largest entry of a direction: smaller ones are not named
 LAGS = 10  # of the test for white residuals
 BY_CHANCE = 1e-4  # probability below which residuals are not called white
-ROUNDING = 1e-9  # of a share that is shown
 OUTLIER = 4.0  # [sigma]
 CHANCE = 4.0  # standard deviations of the misfit by chance
 
@@ -29,12 +29,6 @@ class Residuals:
     white: float  # probability of such correlations by chance [1]
     outliers: int  # residuals above 4 sigma [1]
     count: int  # measured numbers [1]
-
-
-def percent(share: float, sign: str = "") -> str:
-    """A share in percent of two digits: "0.37 %", "+530 %"."""
-    share = 0.0 if abs(share) < ROUNDING else share
-    return f"{100 * share:{sign}.0f} %" if abs(share) >= 0.1 else f"{100 * share:{sign}.2g} %"
 
 
 def judge(residual: Array, tables: Sequence[Array], parameters: int, robust: bool) -> Residuals:
@@ -63,10 +57,10 @@ def judge(residual: Array, tables: Sequence[Array], parameters: int, robust: boo
     return Residuals(misfit, 1 + CHANCE * float(spread), lag, white, int((np.abs(residual) > OUTLIER).sum()), m)
 
 
-def direction_in_words(unknowns: Sequence[Unknown], direction: Array) -> str:
-    """A direction of log theta: "lambda alone", or the product of powers that it stands for."""
+def direction_in_words(unknowns: Sequence[Unknown], direction: Array, least: float = NAMED) -> str:
+    """A direction of log theta: "lambda alone", or a product of powers, those above ``least`` of the largest."""
     direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
-    named = [(u.name, x) for u, x in zip(unknowns, direction, strict=True) if abs(x) > NAMED * np.abs(direction).max()]
+    named = [(u.name, x) for u, x in zip(unknowns, direction, strict=True) if abs(x) > least * np.abs(direction).max()]
     if len(named) == 1:
         return f"{named[0][0]} alone"
     return "the combination " + " ".join(f"{name}^{x:.2g}" for name, x in named)
@@ -80,6 +74,7 @@ def unseen(unknowns: Sequence[Unknown], sizes: Array, directions: Array) -> list
 def reasons(
     unknowns: Sequence[Unknown],
     residuals: Residuals,
+    unsettled: float,
     invisible: Sequence[str],
     noise: Array,
     parts: dict[str, Array | None],
@@ -88,6 +83,7 @@ def reasons(
     """Why an answer is refused, a sentence each.
 
     Args:
+        unsettled: largest change of log theta in the last of too many rounds, 0 where they converged.
         noise: part of the noise in each value, relative.
         parts: that of mesh, time step and reduction, None where it is not known.
         cures: what mends each.
@@ -97,6 +93,11 @@ def reasons(
         found.append(
             f"The misfit is {residuals.misfit:.3g} sigma, and chance leaves at most {residuals.limit:.3g}: the model "
             "lacks something that the data show, or the noise is larger than stated."
+        )
+    if unsettled:
+        found.append(
+            f"The fit does not converge: a value still changes by {percent(unsettled)} in the last round; start nearer "
+            "to the answer, fit other parameters, or state a larger noise."
         )
     found += [f"The data do not see {words}: fit fewer parameters, or measure more." for words in invisible]
     for name, part in parts.items():

@@ -9,8 +9,8 @@ import numpy as np
 
 from softgrasp.fem.columns import labels
 from softgrasp.reduction.identify.result import Identified
-from softgrasp.reduction.identify.verdict import BY_CHANCE, direction_in_words, percent
-from softgrasp.study.report import Section, Table, captioned, listed
+from softgrasp.reduction.identify.verdict import BY_CHANCE, direction_in_words
+from softgrasp.study.report import Section, Share, Table, captioned, listed, percent
 from softgrasp.study.shell import Session
 from softgrasp.study.shell.session import Page
 
@@ -22,6 +22,7 @@ CAPTIONS = {
     "history.png": "Values after each round over the final ones; a round is a fit with one reduced model.",
 }
 ASSUMED_ERROR = 0.1
+SHOWN_POWER = 0.01  # of the largest power of a combination: a small one of a value that is little known counts
 ASSUMED = "Parameters that are not fitted are taken from the scene as exact; their errors come on top."
 
 
@@ -57,9 +58,9 @@ def value_table(answer: Identified) -> Table:
     header = ("parameter", "start", "value", "unit", "noise", *answer.parts, "together")
     rows = [
         (
-            u.name, float(answer.start[i]), float(answer.values[i]), u.unit, percent(answer.noise[i]),
-            *("not known" if part is None else percent(part[i], "+") for part in answer.parts.values()),
-            percent(answer.total[i]),
+            u.name, float(answer.start[i]), float(answer.values[i]), u.unit, Share(answer.noise[i]),
+            *("not known" if part is None else Share(part[i]) for part in answer.parts.values()),
+            Share(answer.total[i]),
         )
         for i, u in enumerate(answer.unknowns)
     ]  # fmt: skip
@@ -69,7 +70,7 @@ def value_table(answer: Identified) -> Table:
 def sight_table(answer: Identified) -> Table:
     """What the data see, the best first."""
     rows = [
-        (direction_in_words(answer.unknowns, d), percent(1 / max(float(s), 1e-12)))
+        (direction_in_words(answer.unknowns, d, SHOWN_POWER), Share(1 / max(float(s), 1e-12)))
         for s, d in zip(answer.sight, answer.directions, strict=True)
     ]
     return Table(("the data see", "with a deviation of"), rows, "What the data see")
@@ -78,7 +79,7 @@ def sight_table(answer: Identified) -> Table:
 def assumed_table(answer: Identified) -> Table:
     """What an error in a parameter that is not fitted does to the values, the largest first."""
     order = sorted(answer.assumed.items(), key=lambda each: -float(np.abs(each[1]).max()))
-    rows = [(name, *(percent(ASSUMED_ERROR * x, "+") for x in change)) for name, change in order]
+    rows = [(name, *(Share(round(ASSUMED_ERROR * x, 9) + 0.0) for x in change)) for name, change in order]
     return Table(("+10 % in", *(f"changes {u.name} by" for u in answer.unknowns)), rows, "What the values rest on")
 
 
@@ -109,6 +110,7 @@ def fit_rows(answer: Identified) -> list[tuple[str, str]]:
     ]
     return [
         ("numbers", f"{r.count} of {listed(labels(answer.columns))}, in {len(answer.data)} experiment(s)"),
+        ("mesh", f"n_e = {answer.model.system.layout.n_e}, {answer.scene.time.steps} time steps, those of fitted.toml"),
         ("misfit", f"{r.misfit:.3g} sigma, by chance at most {r.limit:.3g}"),
         ("white", f"correlation of neighbours {r.lag:+.2g}, probability by chance {max(r.white, 1e-15):.2g}"),
         ("outliers", f"{r.outliers} above 4 sigma"),
