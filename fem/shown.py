@@ -88,7 +88,9 @@ def listed(names: Iterable[str], most: int = 6) -> str:
 
 
 def percent(share: float) -> str:
-    """A share as a percentage of two digits; "> 9999 %" also where it is not finite."""
+    """A share as a percentage of two digits, below 0.0001 % as a number; "> 9999 %" also where it is not finite."""
     if not share < 100:
         return "> 9999 %"
+    if 0 < abs(share) < 1e-6:
+        return f"{share:.2g}"
     return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
