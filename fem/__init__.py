@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from softgrasp.fem.fields.probe import Probe, make_probe
     from softgrasp.fem.fields.series import SeriesWriter
     from softgrasp.fem.fields.vtu import Collection, check_file, note_of
-    from softgrasp.fem.mesh.check import counted
     from softgrasp.fem.mesh.scene_hash import scene_hash, scene_keys
     from softgrasp.fem.mesh.singular import Ends, expected_order
     from softgrasp.fem.mesh.tissue_mesh import TissueMesh
@@ -59,6 +58,7 @@ if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene, scene_schema
     from softgrasp.fem.scene.table import read_csv
     from softgrasp.fem.scene.text import out_of_range, parse_toml, read_text
+    from softgrasp.fem.shown import counted, percent
     from softgrasp.fem.solve.costs import STEP_RTOL
     from softgrasp.fem.solve.modes import lowest_modes
     from softgrasp.fem.solve.solvers import ITERATIVE

@@ -88,7 +88,12 @@ def listed(names: Iterable[str], most: int = 6) -> str:
 
 
 def percent(share: float, sign: str = "") -> str:
-    """A share as a percentage of two digits, "+" with its sign; "> 9999 %" also where it is not finite."""
+    """A share as a percentage of two digits, "+" with its sign, below 0.0001 % as a number.
+
+    "> 9999 %" also where it is not finite.
+    """
     if not abs(share) < 100:
         return "< -9999 %" if share < 0 else "> 9999 %"
+    if 0 < abs(share) < 1e-6:
+        return f"{share:{sign}.2g}"
     return f"{100 * share:{sign}{'.2g' if abs(share) < 0.995 else '.0f'}} %"

@@ -12,7 +12,8 @@ from collections.abc import Callable
 import numpy as np
 
 from softgrasp.fem.errors import MeshError
-from softgrasp.fem.mesh.check import FLAT, Floats, Integers, counted, longest_edges, place_text, quality
+from softgrasp.fem.mesh.check import FLAT, Floats, Integers, longest_edges, place_text, quality
+from softgrasp.fem.shown import counted
 
 STRAIGHT = 1e-5  # of the longest edge: above the 6 digits of text files, far below the error of the elements
 

@@ -16,6 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from softgrasp.fem.errors import MeshError
+from softgrasp.fem.shown import counted
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -79,11 +80,6 @@ def check_cells(points: Floats, cells: Integers, repair: bool, name: str) -> Int
     turned = cells.copy()
     turned[np.ix_(inverted, [-2, -1])] = cells[np.ix_(inverted, [-1, -2])]
     return turned
-
-
-def counted(number: int, what: str) -> str:
-    """A count with its noun, singular or plural."""
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def linked(one: Integers, other: Integers, n: int) -> tuple[int, Ints]:

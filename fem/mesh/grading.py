@@ -21,7 +21,6 @@ from softgrasp.fem.mesh.check import (
     FLAT,
     Floats,
     Ints,
-    counted,
     find_parts,
     longest_edges,
     place_text,
@@ -30,6 +29,7 @@ from softgrasp.fem.mesh.check import (
 )
 from softgrasp.fem.mesh.singular import Ends
 from softgrasp.fem.mesh.tissue_mesh import Marks, MeshArrays, TissueMesh, Whole, spread, structured_mesh
+from softgrasp.fem.shown import counted
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene

@@ -11,10 +11,11 @@ import numpy.typing as npt
 
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.mesh.check import Flags, Floats, Ints, Parts, counted, place_text
+from softgrasp.fem.mesh.check import Flags, Floats, Ints, Parts, place_text
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.petsc import on_root
 from softgrasp.fem.scene.scene import Contact
+from softgrasp.fem.shown import counted
 
 HINGE = 1e-12  # eigenvalue of C^T C over the largest, below which a motion is free [1]: nodes 1e-6 of the part apart
 MOST_LOOSE = 300  # largest number of parts without contact facet [1]: a dense problem of at most 1800 unknowns

@@ -21,10 +21,10 @@ from softgrasp.fem.checksums import (
 )
 from softgrasp.fem.errors import CheckpointError, raise_on_all_ranks, shortened
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.shown import counted
 
 FORMAT = 6
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # keys of [output] that change no number of a run

@@ -15,6 +15,7 @@ from mpi4py import MPI
 from softgrasp.fem.checksums import digest, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
 from softgrasp.fem.errors import CheckpointError, SolverError, raise_on_all_ranks
 from softgrasp.fem.petsc import Array, on_root
+from softgrasp.fem.shown import counted
 from softgrasp.lqr.lowrank.adi import SHARE, AdiSweep, FactorColumns, adi_step, sweep_norms
 from softgrasp.lqr.lowrank.adjoint import AdjointRhs, adjoint_rhs
 from softgrasp.lqr.lowrank.compress import triangular
@@ -189,7 +190,7 @@ class NewtonADI(LowRankSolver[ModalStart]):
             sweep = None
         counts = {"newton_steps": state.step, "adi_steps": state.solves, "solves": state.solves}
         counts["columns"] = sweep.Z.appended
-        about = f"low rank, {state.step} Newton steps, {tissue.name} tissue solves"
+        about = f"low rank, {counted(state.step, 'Newton step')}, {tissue.name} tissue solves"
         return Iterate(sweep.Z.block, sweep.new.block, about, state.history, counts, state.seconds)
 
     def _sweep(

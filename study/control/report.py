@@ -128,7 +128,7 @@ def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[st
         rows.append(("its margins, all inputs at once", f"gain x {low:.3g} {up}, phase {phase:.3g} deg"))
     if whole is not None:
         if whole.bases:
-            rows.append(("excess cost is that of the loop", running_words(study.design)))
+            rows.append(("loop of the excess cost", running_words(study.design)))
         rows += [("re-tuned", _fast(r)) for r in whole.retuned]
         stages = ", ".join(f"{seconds.get(k, 0.0):.3g} s" for k in ("are", "reduced", "loop"))
         rows.append(("time: ARE, reduced, loop", stages))
@@ -218,8 +218,9 @@ def reduced_table(bases: Sequence[BasisGains]) -> Table:
 def margin_section(margins: LoopMargins, figures: Sequence[tuple[Path, str]]) -> Section:
     """One row an input: gain factors, phase margin, crossover, delay; above them what all withstand at once."""
     low, high, phase = margins.together
+    up = f"to {high:.3g}" if high < 1e3 else "upwards"
     text = (
-        f"All inputs together withstand any gain factors from {low:.3g} to {_number(high)}, or phase shifts up to "
+        f"All inputs together withstand any gain factors from {low:.3g} {up}, or phase shifts up to "
         f"{phase:.3g} deg; the smallest singular value of I + L is {margins.distance:.3g}."
     )
     return table_of(margins.axes, MARGINS, "Margins of the small controller").section(text, figures=figures)

@@ -43,10 +43,10 @@ PROOFS = {
 VERDICTS: Columns = {
     "effect": lambda f: f"{f.name} {'on' if f.on else 'off'}",
     "verdict": "label",
-    "outputs": "change.outputs",
-    "deform.": "change.deformation",
-    "force": "control",
-    "advised": "company.change.outputs",
+    "outputs": "change.outputs %",
+    "deform.": "change.deformation %",
+    "force": "control %",
+    "advised": "company.change.outputs %",
     "gate": "gate.gate.number 3",
     "limit": "gate.gate.threshold 3",
 }
@@ -120,11 +120,12 @@ def parts(study: EffectsStudy) -> list[Section]:
 def summary(study: EffectsStudy) -> list[str]:
     """What came out, in three sentences."""
     labels = dict.fromkeys(f.label for f in study.findings)
-    verdicts = [f"{label}: {listed([f.name for f in study.findings if f.label == label])}" for label in labels]
+    named = [(label, [f.name for f in study.findings if f.label == label]) for label in labels]
+    verdicts = [f"{label} {'is' if len(names) == 1 else 'are'} {listed(names)}" for label, names in named]
     change, name = max((f.change.outputs, f.name) for f in study.tried if f.change is not None)
     free = sum(f.proof.holds for f in study.off if f.proof is not None)
     return [
-        f"The verdicts on the effects are {'; '.join(verdicts)}.",
+        f"{'; '.join(verdicts).capitalize()}.",
         f"{name.capitalize()} changes the outputs most, by {percent(change)}; what changes them by less than "
         f"{percent(study.tolerance)} does not count.",
         f"{free} of the {len(study.off)} effects that are off are shown to cost nothing.",

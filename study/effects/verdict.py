@@ -74,7 +74,7 @@ def needed_for_control(s: Switch, control: float | None, gate: EffectReport, sce
 def _advice(s: Switch, verdict: str, change: float, why: str, cost: Cost, tolerance: float) -> str:
     if verdict == "needed":
         text = "Keep it: it changes" if s.on else "Switch it on if it acts on your robot: it would change"
-        text += f" the outputs by {change:.2g}, tolerance {tolerance:g}"
+        text += f" the outputs by {percent(change)}, tolerance {percent(tolerance)}"
         if s.strength is not None and change < 0.1:  # where the change still grows with the strength
             text += f"; below about {s.strength * tolerance / change:.2g} {s.unit} it would not show"
         return text + "."
@@ -89,20 +89,21 @@ def _advice(s: Switch, verdict: str, change: float, why: str, cost: Cost, tolera
 
 def _advice_apart(rival: Rival, change: float, company: JointChange | None, changes: Changes, scene: Scene) -> str:
     """For an effect that shows, but cannot go with one that is advised."""
-    more = f"{rival.name} by {changes[rival.name][0].outputs:.2g}, tolerance {scene.study.tolerance:g}; {rival.why}."
+    change_rival, tolerance = percent(changes[rival.name][0].outputs), percent(scene.study.tolerance)
+    more = f"{rival.name} by {change_rival}, tolerance {tolerance}; {rival.why}."
     begin = f"Switch it on only in place of {rival.name}, which is advised:"
     if company is None or not company.partners:
-        return f"{begin} it would change the outputs by {change:.2g}, {more}"
+        return f"{begin} it would change the outputs by {percent(change)}, {more}"
     force = " when a force moves the hand, as in the control problem" if company.forced else ""
     state = _switching(company.partners, scene)
-    return f"{begin} {state} it would change the outputs by {company.together:.2g}{force}, {more}"
+    return f"{begin} {state} it would change the outputs by {percent(company.together)}{force}, {more}"
 
 
 def _advice_together(s: Switch, change: float, company: JointChange, scene: Scene) -> str:
     """For an effect that shows only when others are switched too."""
     partners, on = listed(company.partners), [EFFECTS[name].active(scene) for name in company.partners]
     force = " when a force moves the hand, as in the control problem" if company.forced else ""
-    number = f"the outputs by {company.together:.2g}{force}, tolerance {scene.study.tolerance:g}"
+    number = f"the outputs by {percent(company.together)}{force}, tolerance {percent(scene.study.tolerance)}"
     among = f", {_switching(company.among, scene)}," if company.among else ""
     if company.pair and s.on and all(on):
         return f"Keep it, or {partners}: each can go alone, but leaving out both{among} changes {number}."

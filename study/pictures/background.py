@@ -25,7 +25,7 @@ def draw_in_background(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[
     """Begin to draw into ``out``; the function returned waits for the files and names them on rank 0. Not collective.
 
     What is drawn must be on this rank already: the process has all of it by fork, nothing is copied or packed, and only
-    the names come back. Several ranks have the cores taken, and their network may not withstand a fork: with them, on
+    the names come back. Several ranks have the cores taken, and their network may not survive a fork: with them, on
     one core and where no process can be started, the pictures are drawn when they are asked for.
 
     Raises (when they are asked for):

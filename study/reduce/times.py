@@ -158,7 +158,7 @@ def timed(p: Timed, full: FullTimes, **more: Any) -> dict[str, Any]:
 TIMES: Columns = {
     "run [ms]": lambda r: f"{1e3 * r['p'].time_online:.2f}",
     "new [ms]": lambda r: f"{1e3 * (r['p'].time_setup + r['p'].time_online):.2f}",
-    "offline [s]": "p.time_offline .2f",
+    "offline [s]": "p.time_offline 3",
     "x again": "up.again .3g",
     "x new": "up.new .3g",
     "break-even": lambda r: "never" if (runs := r["up"].break_even_runs) is None else str(math.ceil(runs)),

@@ -15,8 +15,7 @@ import rich.table
 from rich.console import Console
 from rich.markup import escape
 
-from softgrasp.fem import counted, note
-from softgrasp.fem.shown import percent
+from softgrasp.fem import counted, note, percent
 from softgrasp.study.report.equation import Equation
 
 Columns = Mapping[str, str | Callable[[Any], Any]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import shlex
 import time
 import tomllib
@@ -20,6 +21,7 @@ from softgrasp.study.report import Page, Section, Table
 from softgrasp.study.shell import Session, folder_lock, read_result
 
 ALIKE = 1e-12  # relative difference below which two numbers count as equal: rounding
+COST = re.compile(r"(^|[._])(time(?!_error|_step)|seconds|memory)")  # names of what every run has anew
 LONGEST = 6  # entries of a list that is compared entry by entry
 LIST_WIDTH = 200  # [letters]
 FOREIGN = 5  # files that a list of runs leaves out by name
@@ -107,6 +109,7 @@ def compare(a: Path, b: Path) -> Comparison:
             change = abs(y - x) / max(abs(x), abs(y)) if x != y else 0.0
             if change > ALIKE:
                 numbers.append((name, x, y, y / x - 1 if x else None))
+    numbers.sort(key=lambda row: COST.search(row[0]) is not None)  # stable: the others keep their order
     heads = (str(a), str(b))
     return Comparison(
         Table(("key of the scene", *heads), keys), Table(("number", *heads, "B / A - 1"), numbers), _traces(a, b)
@@ -205,7 +208,9 @@ def compose(comparison: Comparison, session: Session, b: Path) -> Page:
         names, file = (a.name, b.name), session.out / "compare.png"
         drawn = figure_numbers(numbers, names, file) if traces is None else figure_two(*traces, names, file)
     first = [f"{name} is {x} in A and {y} in B" for name, x, y in keys.rows[:3]]
-    found = f"{counted(len(keys.rows), 'key')} and {counted(len(numbers.rows), 'number')} of the results differ."
+    costs = sum(COST.search(row[0]) is not None for row in numbers.rows)
+    found = f"{counted(len(keys.rows), 'key')} and {counted(len(numbers.rows) - costs, 'number')} of the results differ"
+    found += f", and {counted(costs, 'time or size of memory', 'times and sizes of memory')}." if costs else "."
     parts = [
         Section("", figures=[(file, "A and B, and their difference.") for file in drawn[:1]]),
         *([keys.section(title="Keys of the scene", terminal=True)] if keys.rows else []),

@@ -48,11 +48,12 @@ def summary(sweep: Sweep, points: Sequence[SweepPoint]) -> list[str]:
     texts = [f"{len(good)} of {len(points)} points of {' and '.join(keys)} were run with {model}."]
     if name := next(iter(good[0].lags()), ""):
         low, high = (pick(good, key=lambda point: point.lags()[name]) for pick in (min, max))
+        output, unit = name.rstrip("]").split(" lag [")
         at = [
-            f"{p.lags()[name]:.3g}, at {', '.join(f'{a.key} = {p.values[a.key]:g}' for a in sweep.axes)}"
+            f"{p.lags()[name]:.3g} {unit}, at {', '.join(f'{a.key} = {p.values[a.key]:g}' for a in sweep.axes)}"
             for p in (low, high)
         ]
-        texts.append(f"The largest {name} is least, {at[0]}, and most, {at[1]}.")
+        texts.append(f"The lag of {output} is smallest, {at[0]}, and largest, {at[1]}.")
     return [*texts, f"One run took {median(point.numbers['seconds'] or 0.0 for point in good):.2g} s in the median."]
 
 

@@ -36,7 +36,7 @@ static double replay(FILE *log, long *ticks, double *tolerance) {
     return *ticks ? worst : -1;
 }
 
-/* Whether a hand that is not measured ends the loop never, and is counted. */
+/* Whether a hand that is not measured is counted and never ends the loop. */
 static int withstands(void) {
     double zero = 0, q[M] = {0}, v[M] = {0}, last[M], u[M] = {0};
     sg_controller_start(&controller);
@@ -44,13 +44,15 @@ static int withstands(void) {
     if (sg_controller_tick(&controller, q, v, NULL, u) != SG_CONTROLLER_NO_HAND || controller.ticks) return 0;
     q[0] = 0;
     if (sg_controller_tick(&controller, q, v, NULL, last) > SG_CONTROLLER_LOST) return 0;
-    long lost = controller.lost;
+    long before = controller.lost + controller.held;
     q[0] = zero / zero;
     int status = sg_controller_tick(&controller, q, v, NULL, u);
     if (SG_CONTROLLER_OBSERVER ? status != SG_CONTROLLER_LOST && SG_CONTROLLER_DELAY == 0
                                : status != SG_CONTROLLER_HELD || memcmp(u, last, sizeof u))
         return 0;
-    return defect(u, M) == 0 && controller.ticks == 2 && controller.lost + controller.held >= lost;
+    long counted = controller.lost + controller.held - before; /* with a delay a lost sample counts when it is used */
+    int now = !SG_CONTROLLER_OBSERVER || SG_CONTROLLER_DELAY == 0;
+    return defect(u, M) == 0 && controller.ticks == 2 && counted >= now;
 }
 
 int main(int count, char **words) {

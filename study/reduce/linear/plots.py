@@ -274,7 +274,7 @@ def figure_compare(views: Views, out_png: Path) -> tuple[Path, ...]:
     shown = instants(views)
     with style.paper_style():
         times = ", ".join(f"{views.times[k]:.2g}" for k in shown)
-        figure, axes, shot = _figure(views, f"; shown: t = {times} s")
+        figure, axes, shot = _figure(views, f"\nbodies at t = {times} s")
         for k in shown:
             _draw(axes, shot, views, k)
         return style.save(figure, out_png)
