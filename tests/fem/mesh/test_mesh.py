@@ -122,7 +122,7 @@ def test_make_mesh_takes_size_or_file(mpi_tmp_path: Path) -> None:
     tissue = SimpleNamespace(
         size=None, origin=None, cells=None, mesh="a.vtu", scale=0.5, repair=False, seam=1e-4, read_limit=None
     )
-    scene: Any = SimpleNamespace(tissue=tissue, directory=mpi_tmp_path)
+    scene: Any = SimpleNamespace(tissue=tissue, directory=mpi_tmp_path, _given=None)
     assert volume(make_mesh(COMM, scene)) == pytest.approx(0.5, rel=WIDE)
     tissue.size, tissue.cells = [1.0, 1.0], [2, 2]
     assert make_mesh(COMM, scene).source == "structured"

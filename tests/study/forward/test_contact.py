@@ -141,7 +141,7 @@ def test_pictures_show_obstacles_where_they_are() -> None:
     assert shot.low[0] <= -1.2  # the picture takes the disc in
     figure, axes = make_axes(shot, 1, captions=False)
     draw_surroundings(axes[0], shot, [0, 1])
-    legend(figure, axes, shot)
+    legend(figure, shot)
     lines = [c for c in axes[0].collections if not isinstance(c, Quiver)]
     middles = [line.get_paths()[0].vertices[:-1].mean(axis=0) for line in lines]
     assert np.allclose(middles[:2], [[-1.0, 0.5], [-0.7, 0.5]])  # after 1 s at 0.3 m/s
