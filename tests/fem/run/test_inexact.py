@@ -152,4 +152,5 @@ def test_an_iterated_equilibrium_says_how_far_it_is(comm: MPI.Intracomm) -> None
     assert 0.2 < np.median(shares) < 0.8  # digits come evenly
     assert shares[-1] == 1.0
     assert len(shares) > 10  # one an iteration
-    assert (told.outputs == plain.outputs).all()
+    # on ranks sums go in the order of messages; the solves end at 1e-4
+    assert np.abs(told.outputs - plain.outputs).max() <= 1e-4 * np.abs(plain.outputs).max()
