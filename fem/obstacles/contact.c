@@ -2,20 +2,7 @@
    sign change sides at once; after RETRIES rounds that leave as many of them, the last one alone, which is finite. The
    Cholesky factor of W_AA (1 + RIDGE on the diagonal, so that equal rows share their force) follows the set A by rows.
    Below it, the step before half-spaces: gaps of all boundary nodes, forces of those that ever touched, what they do. */
-#include <math.h>
-#include <string.h>
-
-#define RIDGE 1e-13
-#define RETRIES 3
-
-static double dot(int n, const double *a, const double *b) {
-  double s[8] = {0, 0, 0, 0, 0, 0, 0, 0}, r = 0;
-  int i = 0;
-  for (; i + 8 <= n; i += 8)
-    for (int k = 0; k < 8; k++) s[k] += a[i + k] * b[i + k];
-  for (; i < n; i++) r += a[i] * b[i];
-  return r + ((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7]));
-}
+#include "dense.h"
 
 /* One more row of the factor; 0 where its pivot is not positive. */
 static int append(int ld, const double *W, int *m, int *order, double *L, int row) {
@@ -115,24 +102,31 @@ int softgrasp_complement(int p, int ld, const double *W, const double *q, double
 
 typedef struct {
   int p, d, n_s, obstacles; /* boundary nodes, axes, freedoms of the hand, half-spaces */
+  int m;                    /* tangents with friction */
   int n, whole, k;          /* rows here of the step, whether they are all rows, contact rows */
   const double *X, *T;      /* places at rest (p, d), modes of the hand (p d, n_s) */
-  const double *normal;     /* of the half-spaces (obstacles, d) */
+  const double *along;      /* normals of the half-spaces, each before its tangents (obstacles, 1 + m, d) */
   const int *at;            /* row here of each unknown of the boundary, -1 where another rank has it (p d) */
   double *w, *r;            /* half the change of z in the step, and its right-hand side (n) */
   double *z, *moved, *v;    /* displacement, its half change and velocity of the boundary (p d) */
   double *q, *qdot;         /* hand at the end of the step and its velocity there (n_s) */
+  const double *q0, *slide; /* hand at the start of it (n_s), way of the half-spaces in it (obstacles, d) */
   double *level, *rate;     /* n.x of the half-spaces at the end of the step (obstacles), velocities (obstacles, d) */
   double *gap, *after;      /* gaps before and at the end of the step (obstacles, p) */
   char *entered;            /* whether a pair has a row (obstacles, p) */
   double *least;            /* least gaps at the end (obstacles) */
-  const int *row;           /* obstacle, node and column of each contact row (k, 3) */
+  const int *row;           /* obstacle, node, column and direction of each contact row, 0 for the normal (k, 4) */
+  const int *kind;          /* sets of the pairs, see friction.c; 0 without friction */
   const double *columns;    /* S^-1 N' on the rows here, a column after the other (.., n) */
   double *free, *x, *b;     /* right-hand side of the small problem, forces, velocities to stop (k) */
   double *change;           /* what the last `softgrasp_apply` added to the force of each column */
   double *force, *touching, *hand, *gaps; /* tables of the run, see Tables */
-  double *energy;           /* work, energy dissipated at first touch (2) */
+  double *energy;           /* work, energy dissipated at first touch, by impulses, by friction (4) */
 } Flat;
+
+static const double *along(const Flat *f, const int *row) {
+  return f->along + (size_t)(row[0] * (1 + f->m) + row[3]) * f->d;
+}
 
 /* Gaps at the end of the step into `after` and `least`; the largest coordinate. */
 double softgrasp_look(const Flat *f) {
@@ -149,8 +143,9 @@ double softgrasp_look(const Flat *f) {
       most = fmax(most, fabs(x[a]));
     }
     for (int o = 0; o < f->obstacles; o++) {
+      const double *n = f->along + (size_t)o * (1 + f->m) * f->d;
       double g = -f->level[o];
-      for (int a = 0; a < f->d; a++) g += f->normal[o * f->d + a] * x[a];
+      for (int a = 0; a < f->d; a++) g += n[a] * x[a];
       f->after[(size_t)o * f->p + i] = g;
       if (!(g >= f->least[o])) f->least[o] = g; /* so that what is no number is the least */
     }
@@ -158,29 +153,47 @@ double softgrasp_look(const Flat *f) {
   return most;
 }
 
+/* Half the gap of a row at the end of the step, or half its slip in the step. */
+static double value(const Flat *f, int j) {
+  const int *row = f->row + 4 * j;
+  if (row[3] == 0) return f->after[(size_t)row[0] * f->p + row[1]] / 2;
+  const double *t = along(f, row);
+  double slip = 0;
+  for (int a = 0; a < f->d; a++) {
+    const int u = row[1] * f->d + a;
+    double way = 2 * f->moved[u] - f->slide[row[0] * f->d + a];
+    for (int k = 0; k < f->n_s; k++) way += f->T[(size_t)u * f->n_s + k] * (f->q[k] - f->q0[k]);
+    slip += t[a] * way;
+  }
+  return slip / 2;
+}
+
 /* Pairs without a row that end deeper than tol; the largest gap of pressed rows into `reached`. */
 int softgrasp_missing(const Flat *f, double tol, double *reached) {
   int missing = 0;
   for (int i = 0; i < f->obstacles * f->p; i++) missing += f->after[i] < -tol && !f->entered[i];
   *reached = 0;
-  for (int j = 0; j < f->k; j++)
-    if (f->x[j] > 0) *reached = fmax(*reached, fabs(f->after[(size_t)f->row[3 * j] * f->p + f->row[3 * j + 1]]));
+  for (int j = 0; j < f->k; j += 1 + f->m)
+    if (f->x[j] > 0) *reached = fmax(*reached, fabs(f->after[(size_t)f->row[4 * j] * f->p + f->row[4 * j + 1]]));
   return missing;
 }
 
-/* Right-hand side of the small problem from the gaps at the end of a step without forces. */
+/* Half gaps and slips of the rows at the end of the step that is in w. */
+void softgrasp_values(const Flat *f, double *to) {
+  for (int j = 0; j < f->k; j++) to[j] = value(f, j);
+}
+
+/* Right-hand side of the small problem from the end of a step without forces. */
 void softgrasp_begin(const Flat *f) {
-  for (int j = 0; j < f->k; j++) {
-    f->free[j] = f->after[(size_t)f->row[3 * j] * f->p + f->row[3 * j + 1]] / 2;
-    f->x[j] = 0;
-  }
+  softgrasp_values(f, f->free);
+  memset(f->x, 0, f->k * sizeof(double));
 }
 
 static void add_to_r(const Flat *f, int j, double t) {
-  const int *row = f->row + 3 * j;
+  const int *row = f->row + 4 * j;
   for (int a = 0; a < f->d; a++) {
     int at = f->at[row[1] * f->d + a];
-    if (at >= 0) f->r[at] += t * f->normal[row[0] * f->d + a];
+    if (at >= 0) f->r[at] += t * along(f, row)[a];
   }
 }
 
@@ -195,7 +208,7 @@ void softgrasp_apply(const Flat *f, int columns, const double *x) {
     f->x[j] = x[j];
     if (more == 0) continue;
     add_to_r(f, j, more);
-    f->change[f->row[3 * j + 2]] += more;
+    f->change[f->row[4 * j + 2]] += more;
   }
   for (int k = 0; k <= columns; k++) {
     if (k < columns && f->change[k] != 0) {
@@ -216,16 +229,18 @@ void softgrasp_account(const Flat *f, int n) {
   double *force = f->force + (size_t)n * f->obstacles * f->d, *touching = f->touching + (size_t)n * f->obstacles;
   double *hand = f->hand + (size_t)n * f->n_s;
   for (int j = 0; j < f->k; j++) {
-    if (!(f->x[j] > 0)) continue;
-    int o = f->row[3 * j], i = f->row[3 * j + 1];
-    touching[o] += 1;
+    const int *row = f->row + 4 * j, o = row[0], i = row[1];
+    if (!(f->x[j - row[3]] > 0)) continue;
+    const double *e = along(f, row);
+    if (row[3] == 0) touching[o] += 1;
     for (int a = 0; a < f->d; a++) {
-      double x = f->x[j] * f->normal[o * f->d + a];
+      double x = f->x[j] * e[a];
       force[o * f->d + a] += x;
       for (int k = 0; k < f->n_s; k++) hand[k] += f->T[(size_t)(i * f->d + a) * f->n_s + k] * x;
       f->energy[0] += 2 * x * f->moved[i * f->d + a];
     }
-    f->energy[1] += f->x[j] * f->gap[(size_t)o * f->p + i];
+    if (row[3] == 0) f->energy[1] += f->x[j] * f->gap[(size_t)o * f->p + i];
+    else f->energy[3] -= f->x[j] * 2 * value(f, j);
   }
 }
 
@@ -235,25 +250,26 @@ void softgrasp_carry(const Flat *f, int n, int pressed) {
   memcpy(f->gap, f->after, sizeof(double) * f->obstacles * f->p);
   memcpy(f->gaps + (size_t)(n + 1) * f->obstacles, f->least, sizeof(double) * f->obstacles);
   for (int j = 0; pressed && j < f->k; j++)
-    if (f->x[j] > 0) add_to_r(f, j, f->x[j]);
+    if (f->x[j] != 0) add_to_r(f, j, f->x[j]);
 }
 
-/* Velocities b = -N v of pressed nodes, in the order of their rows; the largest, and the largest of any component. */
+/* Velocities b = -N v of the rows of pressed pairs, in their order; the largest along normals and the tangents of nodes
+   that stick, and the largest of any component. */
 double softgrasp_rates(const Flat *f, double *fastest) {
   double most = 0;
-  for (int j = 0, m = 0; j < f->k; j++) {
-    if (!(f->x[j] > 0)) continue;
-    int o = f->row[3 * j], i = f->row[3 * j + 1];
+  for (int j = 0, k = 0; j < f->k; j++) {
+    const int *row = f->row + 4 * j, o = row[0], i = row[1];
+    if (!(f->x[j - row[3]] > 0)) continue;
     double b = 0;
     for (int a = 0; a < f->d; a++) {
       int u = i * f->d + a;
       double v = f->v[u] - f->rate[o * f->d + a];
       for (int k = 0; k < f->n_s; k++) v += f->T[(size_t)u * f->n_s + k] * f->qdot[k];
       *fastest = fmax(*fastest, fabs(v));
-      b -= f->normal[o * f->d + a] * v;
+      b -= along(f, row)[a] * v;
     }
-    f->b[m++] = b;
-    most = fmax(most, fabs(b));
+    f->b[k++] = b;
+    if (row[3] == 0 || f->kind[j / (1 + f->m)] == 1) most = fmax(most, fabs(b));
   }
   return most;
 }

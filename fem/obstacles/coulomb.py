@@ -1,126 +1,341 @@
-"""The contact problem of a step with Coulomb friction in 2D, W = N S^-1 N' with rows n and t of every node.
+"""The contact problem of a step with Coulomb friction, W = N S^-1 N' with rows n and t of every node.
 
-    0 <= x_n,  y_n >= 0,  x_n y_n = 0,   |x_t| <= mu x_n,  x_t = -mu x_n sign(y_t) where y_t is not 0,   y = W x + q,
+    0 <= x_n,  y_n >= 0,  x_n y_n = 0,   |x_t| <= mu x_n,  x_t = -mu x_n y_t / |y_t| where y_t is not 0,   y = W x + q,
 
-y_t half the slip of the step. Newton's method on the sets open, stick and slip of either sign [AC91], which is exact
-when the sets stay; where it comes back to sets seen before, sweeps of Gauss-Seidel over the nodes find others.
+y_t half the slip of the step; a node has one tangent in 2D and two in 3D. Newton's method on the sets open, stick and
+slip [AC91]: in 2D it is exact when the sets stay, in 3D the directions of slipping nodes converge with it. Its factor
+stays while few rows of the matrix are others: those are taken in by a small matrix of their own. Where the method comes
+back to sets seen before, sweeps of Gauss-Seidel over the nodes find others. `friction.c` does so; without a compiler
+NumPy takes the same rounds, each with a factor of its own.
 """
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lu_factor, lu_solve
+from scipy.linalg.lapack import dgetrf
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.obstacles.small import RIDGE
+from softgrasp.fem.obstacles.compiled import RIDGE, compiled
 
 Array = NDArray[Any]
-OPEN, STICK, FORWARD, BACK = range(4)  # sets; FORWARD: x_t = mu x_n, BACK: x_t = -mu x_n
-ROUNDS = 40  # of Newton's method, before and after the sweeps
+OPEN, STICK, SLIP = range(3)
+ROUNDS = 0, 40, 15  # of Newton's method, before and after the sweeps, by the number of tangents
 SWEEPS = 3000
 STILL = 1e-14  # change of the forces by a sweep over the largest, at which sweeps end
+LITTLE = 0.2  # first coefficient of friction that grows
+GROWTH, LEAST = 1.4, 1.04  # by how much it does, and by how much it must
+SOLVED, WANTED = 0, 1  # what `softgrasp_rub` says; else the rounds lead nowhere
+SOURCE = Path(__file__).with_name("friction.c")
+DECLARATIONS = """
+void softgrasp_matrix(Rub *f);
+void softgrasp_units(Rub *f);
+int softgrasp_rub(Rub *f, int begin, int rounds);
+void softgrasp_sweep(Rub *f, int sweeps, double still);
+double softgrasp_wrong(Rub *f);
+"""
+
+
+def friction_library() -> Any:
+    """(ffi, library) of `friction.c`, or None with a warning where it cannot be compiled."""
+    code = SOURCE.read_text()
+    struct = code[code.index("typedef struct {") : code.index("} Rub;")] + "} Rub;\n"
+    return compiled(SOURCE, struct + DECLARATIONS)
 
 
 class Coulomb:
-    """The problem with its last factor.
+    """The problem with its last solution, sets and factor; the number of nodes may grow.
+
+    Args:
+        tangents: of a node.
+        engine: "C" or "NumPy"; empty takes C where there is a compiler.
 
     Attributes:
-        rounds: of Newton's method since the start [1].
-        sweeps: of Gauss-Seidel since the start [1].
+        x: forces, the normal one and then the tangential ones of every node, (k, 1 + tangents).
+        kind: sets of the nodes, (k,).
+        e: directions of the forces of slipping nodes, and a number of the method, (k, 1 + tangents).
+        tally: rounds and sweeps since the start, and one more number.
     """
 
-    def __init__(self) -> None:
-        self.rounds = self.sweeps = 0
-        self.W = np.zeros((0, 0))
-        self.sets, self.factor = b"", (np.zeros((0, 0)), np.zeros(0, dtype=np.intc))
+    def __init__(self, tangents: int, engine: str = "") -> None:
+        self.m = tangents
+        self.code: Any = None if engine == "NumPy" else friction_library()
+        self.tally = np.zeros(3, np.int64)
+        self.x, self.kind, self.e = np.zeros((0, 1 + tangents)), np.zeros(0, np.intc), np.zeros((0, 1 + tangents))
+        self.kind0, self.e0, self.other = np.zeros(0, np.intc), np.zeros((0, 1 + tangents)), np.zeros(0, np.intc)
+        self.W, self.arrays = np.zeros((0, 0)), dict[str, NDArray[Any]]()
+        self.f: Any = None if self.code is None else self.code[0].new("Rub *")
 
-    def solve(self, W: Array, q: Array, mu: Array, kind: Array, tol: float) -> tuple[Array, Array]:
-        """Forces x (2k,), all normal ones before all tangential ones, and the sets of the nodes (k,).
+    @property
+    def rounds(self) -> int:
+        """Rounds of Newton's method since the start [1]."""
+        return int(self.tally[0])
+
+    def fit(self, k: int) -> None:
+        """Room for k nodes; those there keep their forces and sets, the factor goes."""
+        have, s = min(k, len(self.x)), 1 + self.m
+        x, e, kind = np.zeros((k, s)), np.zeros((k, s)), np.full(k, OPEN, np.intc)
+        e[:, 0] = 1.0
+        x[:have], e[:have], kind[:have] = self.x[:have], self.e[:have], self.kind[:have]
+        self.x, self.e, self.kind = x, e, kind
+        self.kind0, self.e0 = kind.copy(), e.copy()
+        if self.code is None:
+            return
+        K = k * s
+        most = max(6, K // 6)
+        self.other = np.zeros(most, np.intc)
+        self.LU, self.pivot, self.y = np.zeros((K, K)), np.zeros(K, np.intc), np.zeros(K)
+        self._point(
+            x=self.x, y=self.y, kind=self.kind, e=self.e, LU=self.LU, pivot=self.pivot, kind0=self.kind0, e0=self.e0,
+            other=self.other, Z=np.zeros((most, K)), V=np.zeros((most, K)), C=np.zeros((most, most)),
+            room=np.zeros(4 * K + most), seen=np.zeros((ROUNDS[self.m], k), np.int8), tally=self.tally,
+        )  # fmt: skip
+        self.f.k, self.f.m, self.f.most, self.f.rows, self.f.count = k, self.m, most, 0, 0
+
+    def _point(self, **arrays: NDArray[Any]) -> None:
+        """Let fields of the struct point at arrays, which are kept."""
+        kinds = {np.dtype(float): "double[]", np.dtype(np.intc): "int[]", np.dtype(np.int8): "char[]"}
+        for name, array in arrays.items():
+            kind = kinds.get(array.dtype, "long[]")
+            setattr(self.f, name, self.code[0].from_buffer(kind, array))
+            self.arrays[name] = array
+
+    def forget(self) -> None:
+        """Drop the factor, as W is another one now."""
+        if self.f is not None:
+            self.f.rows = 0
+
+    def solve(self, k: int, W: Array, q: Array, mu: Array, tol: float) -> Array:
+        """Forces x (k, 1 + tangents) of the first k nodes, from the forces and sets of the last call.
 
         Args:
-            W: symmetric, positive definite, (2k, 2k); its factor is kept while the same array comes again.
-            q: (2k,).
+            W: symmetric, positive definite, rows of a node side by side; contiguous, may have room for more. Its
+                factor is kept while the same array comes again: call `forget` where its entries have changed.
+            q: half the gap and half the slip without forces, (k (1 + tangents),) [m].
             mu: coefficients of friction, (k,).
-            kind: sets to begin with, (k,).
-            tol: by how much gaps may be negative, and slips of the wrong sign.
+            tol: by how much gaps may be negative, and slips of the wrong sign [m].
 
-        Raises SolverError: neither rounds nor sweeps find a solution.
+        Raises SolverError: neither rounds nor sweeps find a solution, nor does friction that grows.
         """
-        if W is not self.W:
-            self.W, self.sets = W, b""
-        kind = np.where((kind == OPEN) & (q[: len(mu)] < 0), STICK, kind)
-        x, kind, found = self._newton(q, mu, kind, tol)
-        if not found:
-            x = self._sweep(q, mu, np.maximum(x[: len(mu)], 0.0))
-            x, kind, found = self._newton(q, mu, _sets(x, mu), tol)
-        if not found:
+        if k != len(self.kind):
+            self.fit(k)
+        opened = (self.kind == OPEN) & (q[:: 1 + self.m] < 0)
+        self.kind[opened] = STICK
+        if not (self._attempt(W, q, mu, tol) or self._grow(W, q, mu, tol)):
             raise SolverError(
-                f"the friction of {len(mu)} nodes has no solution that {SWEEPS} sweeps find; take more time.steps, or "
+                f"the friction of {k} nodes has no solution that {SWEEPS} sweeps find; take more time.steps, or "
                 "less friction"
             )
-        return x, kind
+        return self.x
 
-    def _newton(self, q: Array, mu: Array, kind: Array, tol: float) -> tuple[Array, Array, bool]:
-        """Forces, sets, and whether they belong together."""
-        k, seen = len(mu), set[bytes]()
-        for _ in range(ROUNDS):
-            self.rounds += 1
-            x = self._forces(q, mu, kind)
-            n, t, y = x[:k], x[k:], self.W @ x + q
-            new, on, stick = kind.copy(), kind != OPEN, kind == STICK
-            new[~on & (y[:k] < -tol)] = STICK
-            # without friction a node slips whatever its velocity
-            new[(mu > 0) & (((kind == FORWARD) & (y[k:] > tol)) | ((kind == BACK) & (y[k:] < -tol)))] = STICK
-            new[stick & (t > mu * n)], new[stick & (t < -mu * n)] = FORWARD, BACK
-            new[on & (n <= 0)] = OPEN
-            if np.array_equal(new, kind):
-                return x, kind, True
-            seen.add(kind.tobytes())
-            kind = new
-            if kind.tobytes() in seen:
-                break
-        return x, kind, False
+    def _attempt(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
+        """Whether rounds and sweeps from the present forces and sets find a solution."""
+        return self._in_numpy(W, q, mu, tol) if self.code is None else self._in_c(W, q, mu, tol)
 
-    def _forces(self, q: Array, mu: Array, kind: Array) -> Array:
-        """Forces for which open nodes carry none, sticking ones stay, and slipping ones carry mu x_n."""
-        k = len(mu)
-        on, stick = np.flatnonzero(kind != OPEN), np.flatnonzero(kind == STICK)
-        share = np.select([kind == FORWARD, kind == BACK], [mu, -mu], 0.0)
-        rows, x = np.concatenate([on, k + stick]), np.zeros(2 * k)
-        if len(rows) == 0:
-            return x
-        if kind.tobytes() != self.sets:
-            matrix = self.W[np.ix_(rows, rows)]
-            matrix[np.diag_indices(len(rows))] *= 1 + RIDGE
-            matrix[:, : len(on)] += self.W[np.ix_(rows, k + on)] * share[on]
-            self.factor, self.sets = lu_factor(matrix, overwrite_a=True, check_finite=False), kind.tobytes()
-        x[rows] = lu_solve(self.factor, -q[rows], check_finite=False)
-        x[k:] += share * x[:k]
-        return x
+    def _grow(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
+        """Whether solutions under friction that grows up to mu lead to one."""
+        self.x[:], self.kind[:] = 0.0, np.where(q[:: 1 + self.m] < 0, STICK, OPEN)
+        reached, more = LITTLE / GROWTH, GROWTH
+        kept = self.x.copy(), self.kind.copy(), self.e.copy()
+        while more > LEAST:
+            self.forget()
+            if not self._attempt(W, q, np.minimum(mu, reached * more), tol):
+                more = math.sqrt(more)
+                self.x[:], self.kind[:], self.e[:] = kept
+                continue
+            reached *= more
+            if reached >= mu.max():
+                return True
+            kept = self.x.copy(), self.kind.copy(), self.e.copy()
+        return False
 
-    def _sweep(self, q: Array, mu: Array, n: Array) -> Array:
-        """Forces by projected Gauss-Seidel from normal forces n (k,) on."""
-        k, W, diagonal = len(mu), self.W, np.diag(self.W)
-        x = np.concatenate([n, np.zeros(k)])
-        for _ in range(SWEEPS):
-            self.sweeps += 1
-            most, change = 0.0, 0.0
+    def _in_c(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
+        if W is not self.arrays.get("W"):
+            self.forget()
+        self._point(W=W, q=q, mu=mu)
+        self.f.ld, self.f.tol = W.shape[1], tol
+        if self._rounds():
+            return True
+        self.code[1].softgrasp_sweep(self.f, SWEEPS, STILL)
+        self.forget()
+        kept = self.x.copy(), self.kind.copy(), self.e.copy()
+        if self._rounds():
+            return True
+        self.x[:], self.kind[:], self.e[:] = kept
+        self.forget()
+        return bool(self.code[1].softgrasp_wrong(self.f) <= tol)
+
+    def _rounds(self) -> bool:
+        """Whether Newton's method finds a solution from the present sets."""
+        code, f, begin = self.code[1], self.f, 0
+        while (end := code.softgrasp_rub(f, begin, ROUNDS[self.m])) == WANTED:
+            self._factor()
+            begin = int(self.tally[2])
+        return bool(end == SOLVED)
+
+    def _factor(self) -> None:
+        """The factor of the matrix of the present sets."""
+        self.code[1].softgrasp_matrix(self.f)
+        lu, pivot, _ = dgetrf(self.LU.T, overwrite_a=True)
+        if lu.base is not self.LU and lu is not self.LU:
+            self.LU.T[:] = lu
+        self.pivot[:] = pivot
+
+    # ---- restart
+
+    def state(self) -> Array:
+        """Numbers from which a run continues with the same bits."""
+        count = 0 if self.f is None else int(self.f.count)
+        rows = 0 if self.f is None else int(self.f.rows)
+        head = np.array([len(self.kind), rows, count, *self.tally[:2]], dtype=float)
+        parts = self.x, self.kind, self.e, self.kind0, self.e0, self.other[:count]
+        return np.concatenate([head, *(np.asarray(part, dtype=float).ravel() for part in parts)])
+
+    def resume(self, numbers: Array, W: Array, mu: Array) -> None:
+        """Continue with what `state` returned, and the W and mu of the last call."""
+        k, rows, count = (int(n) for n in numbers[:3])
+        s = 1 + self.m
+        self.fit(k)
+        self.tally[:2] = numbers[3:5]
+        x, kind, e, kind0, e0, other = np.split(numbers[5:], np.cumsum([k * s, k, k * s, k, k * s]))
+        self.x[:], self.e[:] = x.reshape(k, s), e.reshape(k, s)
+        if self.f is not None and rows:
+            self._point(W=W, mu=mu)
+            self.f.ld = W.shape[1]
+            self.kind[:], self.e[:] = kind0, e0.reshape(k, s)
+            self._factor()
+            self.other[:count], self.f.count = other, count
+            self.code[1].softgrasp_units(self.f)
+        self.kind[:], self.e[:] = kind, e.reshape(k, s)
+
+    # ---- without a compiler
+
+    def _in_numpy(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
+        K = len(q)
+        W = W[:K, :K]
+        if self._newton(W, q, mu, tol):
+            return True
+        self._sweep(W, q, mu)
+        kept = self.x.copy(), self.kind.copy(), self.e.copy()
+        if self._newton(W, q, mu, tol):
+            return True
+        self.x[:], self.kind[:], self.e[:] = kept
+        return self._wrong(W, q, mu) <= tol
+
+    def _newton(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
+        """Rounds of Newton's method from the present sets."""
+        k, s, seen = len(mu), 1 + self.m, set[bytes]()
+        w = W.diagonal().reshape(k, s)
+        for _ in range(ROUNDS[self.m]):
+            self.tally[0] += 1
+            seen.add(self._key())
+            J, r = np.zeros_like(W), np.zeros((k, s))
+            y = (W @ self.x.ravel() + q).reshape(k, s)
             for i in range(k):
-                a, b = x[i], x[k + i]
-                x[i] = max(0.0, a - (W[i] @ x + q[i]) / diagonal[i])
-                x[k + i] = np.clip(b - (W[k + i] @ x + q[k + i]) / diagonal[k + i], -mu[i] * x[i], mu[i] * x[i])
-                most, change = max(most, x[i]), max(change, abs(x[i] - a), abs(x[k + i] - b))
-            if change <= STILL * most:
+                J[i * s : (i + 1) * s], r[i] = self._rows(W, w, i, mu[i], y[i])
+            try:
+                self.x -= np.linalg.solve(J, r.ravel()).reshape(k, s)
+            except np.linalg.LinAlgError:
+                return False
+            self.x[self.kind == OPEN] = 0.0
+            slips = self.kind == SLIP
+            if self.m == 1:
+                self.x[slips, 1] = mu[slips] * self.x[slips, 0] * self.e[slips, 0]
+            y = (W @ self.x.ravel() + q).reshape(k, s)
+            before = self.kind.copy()
+            self._classify(w, y, mu, tol)
+            changed = not np.array_equal(before, self.kind)
+            left = max(float(np.abs(self._rows(W, w, i, mu[i], y[i])[1]).max()) for i in range(k)) if k else 0.0
+            if not changed and left <= tol:
+                return True
+            if not np.isfinite(left) or (changed and self.m == 1 and self._key() in seen):
+                return False
+        return False
+
+    def _key(self) -> bytes:
+        sides: Array = np.sign(self.e[:, 0]) * (self.kind == SLIP)
+        return bytes(self.kind.tobytes() + sides.tobytes())
+
+    def _rows(self, W: Array, w: Array, i: int, mu: float, y: Array) -> tuple[Array, Array]:
+        """Rows of the matrix of node i, and its residual."""
+        s, e, x, rows = 1 + self.m, self.e[i, : self.m], self.x[i], slice(i * (1 + self.m), (i + 1) * (1 + self.m))
+        J = W[rows].copy()
+        J[np.arange(s), np.arange(rows.start, rows.stop)] *= 1 + RIDGE
+        if self.kind[i] == OPEN:
+            J[:] = 0.0
+            J[np.arange(s), np.arange(rows.start, rows.stop)] = w[i]
+            return J, w[i] * x
+        if self.kind[i] == STICK:
+            return J, y
+        c, P = self.e[i, -1] if self.m > 1 else 0.0, np.eye(self.m) - np.outer(e, e)
+        J[1:] = c * P @ W[rows][1:]
+        J[1:, rows.start + 1 : rows.stop] += w[i, 1] * (np.eye(self.m) - c * P)
+        J[1:, rows.start] -= w[i, 1] * mu * e
+        return J, np.concatenate([y[:1], w[i, 1] * (x[1:] - mu * x[0] * e)])
+
+    def _classify(self, w: Array, y: Array, mu: Array, tol: float) -> None:
+        """New sets and directions."""
+        for i, (x, n) in enumerate(zip(self.x, mu * self.x[:, 0], strict=True)):
+            kind, e = self.kind[i], self.e[i]
+            if kind == OPEN:
+                kind = STICK if y[i, 0] < -tol else OPEN
+            elif not x[0] > 0:
+                kind = OPEN
+            elif kind == STICK:
+                size = float(np.linalg.norm(x[1:]))
+                if size > n:
+                    kind, e[:-1], e[-1] = SLIP, x[1:] / size, n / size
+            else:
+                against, size = float(y[i, 1:] @ e[:-1]), 0.0
+                if self.m > 1:
+                    z = x[1:] - y[i, 1:] / w[i, 1]
+                    size = float(np.linalg.norm(z))
+                    if size > 0:
+                        e[:-1], e[-1] = z / size, min(1.0, n / size)
+                if mu[i] > 0 and against > tol and (self.m == 1 or size < n):
+                    kind = STICK
+            self.kind[i] = kind
+
+    def _sweep(self, W: Array, q: Array, mu: Array) -> None:
+        """Projected Gauss-Seidel from the present normal forces on."""
+        k, s = len(mu), 1 + self.m
+        x = np.where(np.isfinite(self.x) & (self.x[:, :1] > 0), self.x, 0.0)
+        w = W.diagonal().reshape(k, s)
+        flat = x.ravel()
+        for _ in range(SWEEPS):
+            self.tally[1] += 1
+            before = x.copy()
+            for i in range(k):
+                rows = W[i * s : (i + 1) * s]
+                x[i, 0] = max(0.0, x[i, 0] - (rows[0] @ flat + q[i * s]) / w[i, 0])
+                scale = w[i, 1:].max() + (abs(rows[1, i * s + 2]) if self.m > 1 else 0.0)
+                x[i, 1:] -= (rows[1:] @ flat + q[i * s + 1 : (i + 1) * s]) / scale
+                size, most = float(np.linalg.norm(x[i, 1:])), mu[i] * x[i, 0]
+                if size > most:
+                    x[i, 1:] *= most / size
+            if np.abs(x - before).max() <= STILL * x[:, 0].max():
                 break
-        return x
+        sizes = np.linalg.norm(x[:, 1:], axis=1)
+        inside = sizes < mu * x[:, 0] * (1 - 1e-9)
+        self.x[:], self.kind[:] = x, np.select([x[:, 0] <= 0, inside], [OPEN, STICK], SLIP)
+        self.e[:] = 0.0
+        self.e[:, 0] = 1.0
+        self.e[sizes > 0, :-1] = x[sizes > 0, 1:] / sizes[sizes > 0, None]
+        if self.m > 1:
+            self._classify(w, (W @ x.ravel() + q).reshape(k, s), mu, 0.0)
 
-
-def _sets(x: Array, mu: Array) -> Array:
-    """Sets of forces x (2k,)."""
-    k = len(mu)
-    n, t = x[:k], x[k:]
-    inside = np.abs(t) < mu * n * (1 - 1e-9)
-    return np.select([n <= 0, inside, t >= 0], [OPEN, STICK, FORWARD], BACK)
+    def _wrong(self, W: Array, q: Array, mu: Array) -> float:
+        """How far the forces are from the law, as a gap [m]."""
+        x, w = self.x, W.diagonal().reshape(self.x.shape)
+        y = (W @ x.ravel() + q).reshape(x.shape)
+        z = x[:, 1:] - y[:, 1:] / w[:, 1:2]
+        size, most = np.linalg.norm(z, axis=1), mu * np.maximum(x[:, 0], 0.0)
+        z *= np.where(size > most, most / np.where(size > 0, size, 1.0), 1.0)[:, None]
+        return float(max(
+            (np.abs(x[:, 0] - np.maximum(0.0, x[:, 0] - y[:, 0] / w[:, 0])) * w[:, 0]).max(initial=0.0),
+            (np.abs(x[:, 1:] - z) * w[:, 1:2]).max(initial=0.0),
+        ))  # fmt: skip

@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.obstacles.compiled import contact_library
+from softgrasp.fem.obstacles.compiled import RETRIES, RIDGE, contact_library
 
 Array = NDArray[Any]
-RIDGE = 1e-13  # share of the diagonal that makes equal rows share their force [1]; in `contact.c` too
-RETRIES = 3  # rounds without progress before rows change sides one by one; in `contact.c` too
 MOST = 40  # rounds for each row, at most: few problems take ten in all
 
 

@@ -34,30 +34,37 @@ class FlatContact(Contact):
         self.ffi, self.c = contact_library()
         shapes = [o.shape for o in self.obstacles]
         self.normals = np.array([s.normal for s in shapes if isinstance(s, HalfSpace)])
+        self.along = self._axes()
         self.offsets = np.array([s.offset for s in shapes if isinstance(s, HalfSpace)])
         self.moving = [(i, o) for i, o in enumerate(self.obstacles) if o.path is not None]
         self.x = np.zeros(0)
         self.f, self.arrays, self.reached = self.ffi.new("Flat *"), dict[str, NDArray[Any]](), self.ffi.new("double *")
         self._describe()
-        self.row, self.W, self.pressed = np.zeros((0, 3), np.intc), np.zeros((0, 0)), False
+        self.row, self.W, self.pressed = np.zeros((0, 4), np.intc), np.zeros((0, 0)), False
         self._grow(16, 0)
+
+    def _axes(self) -> Array:
+        """Directions of the rows of a pair, the normal first, (obstacles, rows, d)."""
+        return self.normals[:, None]
 
     def _describe(self) -> None:
         """Fill the struct of `contact.c`."""
         m, f, table, (obstacles, d), size = self.midpoint, self.f, self.table, self.normals.shape, self.p * self.d
         at = np.full(size, -1, np.intc)
         at[self.order] = self.places
-        f.p, f.d, f.n_s, f.obstacles = self.p, d, self.layout.n_s, obstacles
+        f.p, f.d, f.n_s, f.obstacles, f.m = self.p, d, self.layout.n_s, obstacles, self.along.shape[1] - 1
         f.n, f.whole, f.k = len(m.w_array), self.whole or self.layout.comm.size == 1, 0
         self.v, self.q, self.qdot = np.zeros(size), np.zeros(f.n_s), np.zeros(f.n_s)
         self.level, self.rate, self.least = self.offsets.copy(), np.zeros((obstacles, d)), np.zeros(obstacles)
+        self.q0, self.slide = np.zeros(f.n_s), np.zeros((obstacles, d))
         self.gaps, self.after = np.zeros((2, obstacles, self.p))
         self.entered = np.zeros((obstacles, self.p), dtype=bool)
         self._point(
-            X=self.surface.X, T=np.ascontiguousarray(self.surface.T), normal=self.normals, at=at, w=m.w_array,
-            r=m.r_array, z=self.z, moved=self.moved, v=self.v, q=self.q, qdot=self.qdot, level=self.level,
-            rate=self.rate, gap=self.gaps, after=self.after, entered=self.entered, least=self.least, force=table.force,
-            touching=table.touching, hand=table.hand, gaps=table.gap, energy=table.energy,
+            X=self.surface.X, T=np.ascontiguousarray(self.surface.T), along=np.ascontiguousarray(self.along), at=at,
+            w=m.w_array, r=m.r_array, z=self.z, moved=self.moved, v=self.v, q=self.q, qdot=self.qdot, q0=self.q0,
+            slide=self.slide, level=self.level, rate=self.rate, gap=self.gaps, after=self.after,
+            entered=self.entered, least=self.least, force=table.force, touching=table.touching, hand=table.hand,
+            gaps=table.gap, energy=table.energy,
         )  # fmt: skip
 
     def _point(self, **arrays: NDArray[Any]) -> None:
@@ -82,6 +89,7 @@ class FlatContact(Contact):
         for i, obstacle in self.moving:
             self.level[i] = self.offsets[i] + float(self.normals[i] @ obstacle.shift(n * self.dt))
             self.rate[i] = obstacle.rate(n * self.dt)
+            self.slide[i] = obstacle.shift(n * self.dt) - obstacle.shift((n - 1) * self.dt)
 
     def _look(self, n: int) -> float:
         """Gaps at the end of step n, with the tolerance of their rounding. Collective."""
@@ -94,7 +102,7 @@ class FlatContact(Contact):
 
     def press(self, n: int, drive: TableDrive | ForceDrive) -> None:
         """See :meth:`Contact.press`. Collective."""
-        self.n, self.drive = n, drive
+        self.n, self.drive, self.q0[:] = n, drive, drive.q[n]
         self._place(n + 1)
         tol = self._look(n)
         self.pressed = bool((self.least < 0).any())
@@ -106,11 +114,11 @@ class FlatContact(Contact):
 
     def _settle_flat(self, n: int, tol: float, drive: TableDrive | ForceDrive) -> None:
         """Forces of the step, by rounds in which rows enter. Collective."""
-        c, f, small, responses = self.c, self.f, self.small, self.responses
+        c, f, responses = self.c, self.f, self.responses
         if c.softgrasp_missing(f, 0.0, self.reached):
             self._enter(np.argwhere((self.after < 0) & ~self.entered))
         for _ in range(MOST):
-            x = small.solve(f.k, self.W, self.free, tol / 4)
+            x = self._balance(tol / 4)
             c.softgrasp_apply(f, responses.count, self.ffi.from_buffer("double[]", x))
             self._push_hand(n, self.change[: responses.count], drive)
             self._look(n)
@@ -124,13 +132,18 @@ class FlatContact(Contact):
                 self._refresh()  # what rounding left
         raise unsettled(float(self.reached[0]))
 
+    def _balance(self, tol: float) -> Array:
+        """Forces of the rows that leave no gap below -tol."""
+        return self.small.solve(self.f.k, self.W, self.free, tol)
+
     def _enter(self, pairs: Ints) -> None:
         """Give pairs of half-space and node, (m, 2), their rows in W. Collective."""
-        have, k = len(self.row), len(self.row) + len(pairs)
-        keys = [(int(i), self.numbers[o][0]) for o, i in pairs]
+        each = self.along.shape[1]
+        have, k = len(self.row), len(self.row) + each * len(pairs)
+        keys = [(int(i), number) for o, i in pairs for number in self.numbers[o]]
         self.responses.enter(keys)
-        columns = [[self.responses.where[key]] for key in keys]
-        self.row = np.ascontiguousarray(np.vstack([self.row, np.hstack([pairs, columns])]), np.intc)
+        columns = [[self.responses.where[key], j % each] for j, key in enumerate(keys)]
+        self.row = np.ascontiguousarray(np.vstack([self.row, np.hstack([np.repeat(pairs, each, 0), columns])]), np.intc)
         self.entered[pairs[:, 0], pairs[:, 1]] = True
         if k > len(self.W):
             self._grow(max(16, 2 * k), have)
@@ -152,7 +165,8 @@ class FlatContact(Contact):
     def _refresh(self) -> None:
         """Gaps of the rows without their forces, from the gaps with them."""
         k = len(self.row)
-        self.free[:k] = self.after[self.row[:, 0], self.row[:, 1]] / 2 - self.W[:k, :k] @ self.x[:k]
+        self.c.softgrasp_values(self.f, self.ffi.from_buffer("double[]", self.free))
+        self.free[:k] -= self.W[:k, :k] @ self.x[:k]
 
     def finish(self, state: TissueState) -> None:
         """See :meth:`Contact.finish`. Collective."""
@@ -166,13 +180,19 @@ class FlatContact(Contact):
         self.reached[0] = self.fastest
         most = self.c.softgrasp_rates(self.f, self.reached)
         self.fastest = self.reached[0]
-        if most > max(STILL * self.fastest, self.s * self.tol):
-            rows = self._pressed_rows()
-            self._strike(state, n, rows, rows.normal, self.stops[: len(rows.node)])
+        still = max(STILL * self.fastest, self.s * self.tol)
+        if most > still:
+            self._halt_flat(state, n, still)
+
+    def _halt_flat(self, state: TissueState, n: int, still: float) -> None:
+        """The impulse on pressed rows, one of which is faster than ``still``. Collective."""
+        rows = self._pressed_rows()
+        assert self.drive is not None
+        self.strike.stop(state, self.drive, n, rows.obstacle, rows.node, rows.normal, self.stops[: len(rows.node)])
 
     def _pressed_rows(self) -> Rows:
         on = np.flatnonzero(self.x[: len(self.row)] > 0)
-        obstacle, node, _ = self.row[on].T
+        obstacle, node, *_ = self.row[on].T
         return Rows(obstacle.astype(np.intp), node.astype(np.intp), self.normals[obstacle], self.x[on])
 
     def pressing(self) -> Array:
@@ -180,13 +200,17 @@ class FlatContact(Contact):
         forces = np.zeros((self.p, self.d))
         if self.pressed:
             rows = self._pressed_rows()
-            np.add.at(forces, rows.node, rows.x[:, None] * rows.normal)
+            np.add.at(forces, rows.node, rows.forces())
         return forces
 
     def _sets(self) -> list[NDArray[Any]]:
         """See :meth:`Contact._sets`: the rows in their order, and the set with its factor."""
         m = len(self.small.active)
-        return [self.row[:, :2].ravel(), self.small.active, self.small.L[:m, :m].ravel()]
+        return [self._pairs().ravel(), self.small.active, self.small.L[:m, :m].ravel()]
+
+    def _pairs(self) -> Ints:
+        """Pairs of half-space and node, (m, 2), in the order of their rows."""
+        return self.row[:: self.along.shape[1], :2].astype(np.intp)
 
     def _resume(self, sets: list[Array]) -> None:
         """See :meth:`Contact._resume`. Collective."""

@@ -1,8 +1,12 @@
-"""Contact with Coulomb friction in 2D: forces x_t along the tangent of a pressed node, |x_t| <= mu x_n.
+"""Contact with Coulomb friction: forces x_t along the tangents of a pressed node, |x_t| <= mu x_n.
 
 The slip of a step is that of the node against the obstacle, hand included, over the step; a slipping node has x_t
-against it. So x_t does the work x_t slip <= 0 at an obstacle at rest, exactly, and sticking nodes do none. What sticks
-stops along its tangent too when the impulse comes.
+against it. So x_t does the work x_t'slip <= 0 at an obstacle at rest, exactly, and sticking nodes do none. What sticks
+stops along its tangents too when the impulse y comes, as far as the impulse of the whole step, p = dt x + y, allows:
+
+    0 <= p_n,  v_n >= 0,  p_n v_n = 0,   |p_t| <= mu p_n,  p_t = -mu p_n v_t / |v_t| where v_t is not 0
+
+for the velocities v after it. So the mean force of a step obeys Coulomb's law with its impulses.
 """
 
 from __future__ import annotations
@@ -18,25 +22,67 @@ from softgrasp.fem.obstacles import HalfSpace
 from softgrasp.fem.obstacles.coulomb import OPEN, STICK, Coulomb
 from softgrasp.fem.obstacles.obstacle import Obstacle
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.contact.flat import FlatContact
 from softgrasp.fem.run.contact.general import Contact
 from softgrasp.fem.run.contact.rows import Flags, Ints, Rows
 from softgrasp.fem.run.hand import HandStep
-from softgrasp.fem.run.midpoint import TissueMidpoint
+from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive
+
+
+def tangents(normal: Array) -> Array:
+    """Unit vectors (k, d - 1, d) that are perpendicular to normals (k, d) of any length, and to each other."""
+    if normal.shape[1] == 2:
+        turned = np.stack([-normal[:, 1], normal[:, 0]], axis=1)[:, None]
+        return np.asarray(turned / np.linalg.norm(turned, axis=2)[:, :, None])
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+    first /= np.linalg.norm(first, axis=1)[:, None]
+    second = np.cross(normal, first)
+    return np.stack([first, second / np.linalg.norm(second, axis=1)[:, None]], axis=1)
 
 
 @dataclass
 class RubbingRows(Rows):
     """Contact rows with friction."""
 
-    tangent: Array  # unit tangent of the step, (k, d)
-    x_t: Array  # force along it [N], (k,)
-    slip: Array  # slip along it in the step [m], (k,)
-    kind: NDArray[np.int8]  # set, see `softgrasp.fem.obstacles.coulomb`, (k,)
+    tangent: Array  # unit tangents of the step, (k, d - 1, d)
+    x_t: Array  # forces along them [N], (k, d - 1)
+    slip: Array  # slips along them in the step [m], (k, d - 1)
+    kind: NDArray[np.intc]  # sets, see `softgrasp.fem.obstacles.coulomb`, (k,)
+    e: Array  # directions of slipping nodes, see there, (k, d)
 
     def forces(self) -> Array:
         """See :meth:`Rows.forces`."""
-        return self.x[:, None] * self.normal + self.x_t[:, None] * self.tangent
+        return np.asarray(self.x[:, None] * self.normal + np.einsum("ka,kad->kd", self.x_t, self.tangent))
+
+
+def stop_rubbing(contact: Contact, jolt: Coulomb, state: TissueState, n: int, rows: RubbingRows, mu: Array,
+                 along: Array, v: Array, still: float) -> bool:  # fmt: skip
+    """Whether an impulse with friction stops rows at the end of step n; if not, nothing has changed. Collective.
+
+    It does not where the friction of its nodes would not take energy, over the whole step.
+
+    Args:
+        jolt: problem of the impulses, without forces or sets of its own.
+        mu: coefficients of friction, (k,).
+        along: normal and tangents of each row, (k, d, d).
+        v: velocities along them, (k, d).
+        still: velocity that is rounding [m/s].
+    """
+    k, s = v.shape
+    obstacle, node, axes = np.repeat(rows.obstacle, s), np.repeat(rows.node, s), along.reshape(-1, s)
+    A, before = contact.strike.reactions().matrix(node, axes), np.ascontiguousarray(v.ravel())
+    pushed = contact.dt * np.column_stack([rows.x, rows.x_t])
+    jolt.fit(k)
+    jolt.x[:], jolt.kind[:], jolt.e[:] = pushed, rows.kind, rows.e
+    y = (jolt.solve(k, np.ascontiguousarray(A), before - A @ pushed.ravel(), mu, still) - pushed).ravel()
+    taken = (-y * (before + A @ y / 2)).reshape(k, s)
+    if taken[:, 1:].sum() - np.einsum("ka,ka->", rows.x_t, rows.slip) < 0:
+        return False
+    contact.table.energy[2:] += taken[:, 0].sum(), taken[:, 1:].sum()
+    assert contact.drive is not None
+    contact.strike.strike(state, contact.drive, n, obstacle, node, axes, y)
+    return True
 
 
 class FrictionContact(Contact):
@@ -47,7 +93,7 @@ class FrictionContact(Contact):
     def __init__(self, model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> None:
         super().__init__(model, midpoint, steps, hand)
         self.mu = np.array([entry.friction for entry in model.scene.obstacle or []])
-        self.coulomb = Coulomb()
+        self.coulomb, self.jolt = Coulomb(self.d - 1), Coulomb(self.d - 1)
         self.flat = all(isinstance(o.shape, HalfSpace) for o in self.obstacles)
         self.pairs, self.C, self.W = np.zeros((0, 2), dtype=int), np.zeros((0, 0)), np.zeros((0, 0))
 
@@ -57,16 +103,16 @@ class FrictionContact(Contact):
 
     def _make_rows(self, pairs: Ints) -> RubbingRows:
         """See :meth:`Contact._make_rows`."""
-        rows, k = super()._make_rows(pairs), len(pairs)
+        rows, k, m = super()._make_rows(pairs), len(pairs), self.d - 1
         return RubbingRows(
-            rows.obstacle, rows.node, rows.normal, rows.x, np.zeros((k, self.d)), np.zeros(k), np.zeros(k),
-            np.full(k, OPEN, np.int8),
+            rows.obstacle, rows.node, rows.normal, rows.x, np.zeros((k, m, self.d)), np.zeros((k, m)), np.zeros((k, m)),
+            np.full(k, OPEN, np.intc), np.zeros((k, self.d)),
         )  # fmt: skip
 
     def press(self, n: int, drive: TableDrive | ForceDrive) -> None:
         """See :meth:`Contact.press`. Collective."""
         super().press(n, drive)
-        self.table.energy[3] -= self.rows.x_t @ self.rows.slip
+        self.table.energy[3] -= np.einsum("ka,ka->", self.rows.x_t, self.rows.slip)
         self.small.tally[0] = self.coulomb.rounds
 
     def _forces(
@@ -74,38 +120,136 @@ class FrictionContact(Contact):
     ) -> tuple[Array, RubbingRows]:
         """See :meth:`Contact._forces`. Collective."""
         pairs = np.argwhere(known)
-        rows, k = self._make_rows(pairs), len(pairs)
-        begun = np.full(known.shape, OPEN, np.int8)
-        begun[self.rows.obstacle, self.rows.node] = self.rows.kind
-        q = self._look_along(rows, n, x0, free, x1)
-        turned = np.stack([-rows.normal[:, 1], rows.normal[:, 0]], axis=1)
-        rows.tangent = turned / np.linalg.norm(turned, axis=1)[:, None]
+        rows, k, s, before = self._make_rows(pairs), len(pairs), self.d, self.rows
+        q = np.zeros((k, s))
+        q[:, 0] = self._look_along(rows, n, x0, free, x1)
+        rows.tangent = tangents(rows.normal)
         shifts = [o.shift((n + 1) * self.dt) - o.shift(n * self.dt) + np.zeros(self.d) for o in self.obstacles]
         moved = (free - x0)[rows.node] - np.array(shifts)[rows.obstacle]
-        q = np.concatenate([q, np.einsum("ij,ij->i", rows.tangent, moved) / 2])
-        if not (self.flat and np.array_equal(pairs, self.pairs)):  # where normals stay, W stays with the pairs
-            directions = np.vstack([rows.normal, rows.tangent])
-            self.C, self.pairs = self.select(self.responses, np.vstack([pairs, pairs]), directions), pairs
+        q[:, 1:] = np.einsum("kad,kd->ka", rows.tangent, moved) / 2
+        coulomb, stays = self.coulomb, np.array_equal(pairs, self.pairs)
+        if not (self.flat and stays):  # where normals stay, W stays with the pairs
+            directions = np.concatenate([rows.normal[:, None], rows.tangent], axis=1).reshape(-1, s)
+            self.C, self.pairs = self.select(self.responses, np.repeat(pairs, s, axis=0), directions), pairs
             m = self.C.shape[1]
-            self.W = self.C @ self.responses.G[:m, :m] @ self.C.T
-        x, kind = self.coulomb.solve(self.W, q, self.mu[rows.obstacle], begun[rows.obstacle, rows.node], tol / 4)
-        rows.x, rows.x_t, rows.kind = x[:k], x[k:], kind.astype(np.int8)
-        rows.slip = 2 * (q + self.W @ x)[k:]
-        return self.C.T @ x, rows
+            self.W = np.ascontiguousarray(self.C @ self.responses.G[:m, :m] @ self.C.T)
+            coulomb.fit(k)
+            if len(before.node):
+                number = np.full(known.shape, -1)
+                number[before.obstacle, before.node] = np.arange(len(before.node))
+                at = number[rows.obstacle, rows.node]
+                there, at = at >= 0, at[at >= 0]
+                coulomb.kind[there], coulomb.e[there] = before.kind[at], before.e[at]
+                coulomb.x[there] = np.column_stack([before.x, before.x_t])[at]
+        load = q.ravel()
+        x = coulomb.solve(k, self.W, load, self.mu[rows.obstacle], tol / 4)
+        rows.x, rows.x_t, rows.kind, rows.e = x[:, 0].copy(), x[:, 1:].copy(), coulomb.kind.copy(), coulomb.e.copy()
+        rows.slip = 2 * (load + self.W @ x.ravel()).reshape(k, s)[:, 1:]
+        return self.C.T @ x.ravel(), rows
 
-    def _held_back(self, rows: Rows, normal: Array, v: Array) -> tuple[Rows, Array, Array]:
-        """See :meth:`Contact._held_back`: sticking nodes stop along their tangents too."""
-        stuck = self.rows.kind == STICK
-        every = self._make_rows(np.vstack([np.stack([r.obstacle, r.node], axis=1) for r in (rows, rows.take(stuck))]))
-        turned = np.stack([-normal[stuck, 1], normal[stuck, 0]], axis=1)
-        return every, np.vstack([normal, turned]), np.vstack([v, v[stuck]])
+    def _halt(self, state: TissueState, n: int, rows: Rows, normal: Array, v: Array, still: float) -> None:
+        """See :meth:`Contact._halt`. Collective."""
+        assert isinstance(rows, RubbingRows)
+        along = np.concatenate([normal[:, None], tangents(normal)], axis=1)
+        speed = np.einsum("kad,kd->ka", along, v)
+        stuck = rows.kind == STICK
+        if max(np.abs(speed[:, 0]).max(), np.abs(speed[stuck]).max(initial=0.0)) <= still:
+            return
+        if not stop_rubbing(self, self.jolt, state, n, rows, self.mu[rows.obstacle], along, speed, still):
+            super()._halt(state, n, rows, normal, v, still)
 
     def _sets(self) -> list[NDArray[Any]]:
         """See :meth:`Contact._sets`."""
-        return [*super()._sets(), self.rows.kind.astype(float)]
+        return [*super()._sets(), self.pairs.ravel().astype(float), self.coulomb.state()]
 
     def _resume(self, sets: list[Array]) -> None:
         """See :meth:`Contact._resume`. Collective."""
-        super()._resume(sets)
-        self.coulomb.rounds = self.small.rounds
-        self.rows.kind = sets[1].astype(np.int8)
+        super()._resume(sets[:1])
+        self.pairs = sets[1].reshape(-1, 2).astype(int)
+        k, s = len(self.pairs), self.d
+        if k:
+            normal = np.array([self._flat_normal(o) for o in self.pairs[:, 0]])
+            directions = np.concatenate([normal[:, None], tangents(normal)], axis=1).reshape(-1, s)
+            self.C = self.select(self.responses, np.repeat(self.pairs, s, axis=0), directions)
+            m = self.C.shape[1]
+            self.W = np.ascontiguousarray(self.C @ self.responses.G[:m, :m] @ self.C.T)
+        self.coulomb.resume(sets[2], self.W, self.mu[self.pairs[:, 0]])
+        number = {(int(o), int(i)): j for j, (o, i) in enumerate(self.pairs)}
+        at = [number[int(o), int(i)] for o, i in zip(self.rows.obstacle, self.rows.node, strict=True)]
+        x = self.coulomb.x[at]
+        self.rows.x, self.rows.x_t = x[:, 0].copy(), x[:, 1:].copy()
+        self.rows.kind, self.rows.e = self.coulomb.kind[at], self.coulomb.e[at]
+
+    def _flat_normal(self, obstacle: int) -> Array:
+        """Normal of a half-space; any vector for other shapes, whose W does not stay."""
+        shape = self.obstacles[obstacle].shape
+        return shape.normal if isinstance(shape, HalfSpace) else np.eye(self.d)[0]
+
+
+class FlatFriction(FlatContact):
+    """`FrictionContact` before half-spaces; there must be a compiler."""
+
+    def __init__(self, model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> None:
+        self.mu = np.array([entry.friction for entry in model.scene.obstacle or []])
+        d = 3 if len((model.scene.obstacle or [])[0].normal or []) == 3 else 2
+        self.coulomb, self.jolt = Coulomb(d - 1), Coulomb(d - 1)
+        super().__init__(model, midpoint, steps, hand)
+
+    def _basis(self, obstacle: Obstacle) -> Array:
+        """See :meth:`Contact._basis`: the normal, then its tangents."""
+        assert isinstance(obstacle.shape, HalfSpace)
+        normal = obstacle.shape.normal[None]
+        return np.vstack([normal, tangents(normal)[0]])
+
+    def _axes(self) -> Array:
+        """See :meth:`FlatContact._axes`."""
+        return np.concatenate([self.normals[:, None], tangents(self.normals)], axis=1)
+
+    def _enter(self, pairs: Ints) -> None:
+        """See :meth:`FlatContact._enter`. Collective."""
+        super()._enter(pairs)
+        self.coulomb.fit(len(self._pairs()))
+        self._point(kind=self.coulomb.kind)
+        self.friction = self.mu[self._pairs()[:, 0]]
+
+    def _balance(self, tol: float) -> Array:
+        """See :meth:`FlatContact._balance`."""
+        k = self.f.k
+        x = self.coulomb.solve(k // self.d, self.W, self.free[:k], self.friction, tol)
+        self.small.tally[0] = self.coulomb.tally[0]
+        return x
+
+    def _pressed_rows(self) -> RubbingRows:
+        s, k = self.d, len(self.row)
+        x, on = self.x[:k].reshape(-1, s), np.flatnonzero(self.x[:k:s] > 0)
+        obstacle, node = self._pairs()[on].T
+        slip = np.zeros(k)
+        self.c.softgrasp_values(self.f, self.ffi.from_buffer("double[]", slip))
+        return RubbingRows(
+            obstacle, node, self.normals[obstacle], x[on, 0], self.along[obstacle, 1:], x[on, 1:],
+            2 * slip.reshape(-1, s)[on, 1:], self.coulomb.kind[on], self.coulomb.e[on],
+        )  # fmt: skip
+
+    def _halt_flat(self, state: TissueState, n: int, still: float) -> None:
+        """See :meth:`FlatContact._halt_flat`. Collective."""
+        rows, s = self._pressed_rows(), self.d
+        v = -self.stops[: s * len(rows.node)].reshape(-1, s)
+        mu, along = self.mu[rows.obstacle], self.along[rows.obstacle]
+        if not stop_rubbing(self, self.jolt, state, n, rows, mu, along, v, still):
+            b = -v[:, 0]
+            if np.abs(b).max() > still:
+                assert self.drive is not None
+                self.strike.stop(state, self.drive, n, rows.obstacle, rows.node, rows.normal, b)
+
+    def _sets(self) -> list[NDArray[Any]]:
+        """See :meth:`Contact._sets`."""
+        return [self._pairs().ravel(), self.coulomb.state()]
+
+    def _resume(self, sets: list[Array]) -> None:
+        """See :meth:`Contact._resume`. Collective."""
+        pairs = sets[0].reshape(-1, 2).astype(int)
+        if not len(pairs):
+            return
+        self._enter(pairs)
+        self.coulomb.resume(sets[1], self.W, self.friction)
+        self._point(kind=self.coulomb.kind)

@@ -29,10 +29,10 @@ from softgrasp.fem.obstacles import HalfSpace, make_obstacles
 from softgrasp.fem.obstacles.obstacle import Obstacle, check_passage, mean_normal
 from softgrasp.fem.obstacles.responses import Responses
 from softgrasp.fem.obstacles.small import SmallProblem
-from softgrasp.fem.petsc import Array, rows_on_all, total
-from softgrasp.fem.run.contact.impulse import stopping_impulse
+from softgrasp.fem.petsc import Array, rows_on_all
 from softgrasp.fem.run.contact.record import ContactRecord, Tables
 from softgrasp.fem.run.contact.rows import Flags, Ints, Rows
+from softgrasp.fem.run.contact.strike import Strike
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive
@@ -85,10 +85,10 @@ class Contact:
         self.drive: TableDrive | ForceDrive | None = None
         self.n = 0  # number of the step in work
         self.responses = self._make_responses()
-        self.room = system.M_ee.createVecs()
+        self.strike = Strike(system, self.surface, midpoint, self.table, hand is not None)
 
     def _make_responses(self) -> Responses:
-        bases = [self._basis(o) for o in self.obstacles]
+        self.bases = bases = [self._basis(o) for o in self.obstacles]
         directions = np.unique(np.vstack(bases), axis=0)
         self.numbers = [[int(np.flatnonzero((directions == n).all(axis=1))[0]) for n in basis] for basis in bases]
         self.b, self.y, reach = self.midpoint.r.duplicate(), self.midpoint.w.duplicate(), None
@@ -237,7 +237,7 @@ class Contact:
         responses.enter([key for several in keys for key in several])
         C = np.zeros((len(pairs), responses.count))
         for row, several in enumerate(keys):
-            shares = normal[row] if len(several) > 1 else [1.0]
+            shares = self.bases[pairs[row, 0]] @ normal[row] if len(several) > 1 else [1.0]
             C[row, [responses.where[key] for key in several]] = shares
         return C
 
@@ -276,8 +276,12 @@ class Contact:
             self.gaps = self._gaps(self.surface.places(self.drive.q[n + 1], self.z), n + 1)  # the bits of a restart
         self.table.gap[n + 1] = self.gaps.min(axis=1)
         if len(self.rows.node):
-            self.midpoint.r.array_w[self.places] += self.forces[self.order]  # which r lacks once more, as it lacks G c
+            self._carry()
             self._stop(state, n + 1)
+
+    def _carry(self) -> None:
+        """Give r the forces once more, which it lacks as it lacks G c. Collective."""
+        self.midpoint.r.array_w[self.places] += self.forces[self.order]
 
     def _stop(self, state: TissueState, n: int) -> None:
         """The inelastic impulse on pressed nodes at the end of step n. Collective."""
@@ -291,44 +295,15 @@ class Contact:
             normal[mine] = obstacle.normal(x[mine], n * self.dt)
             v[mine] -= obstacle.rate(n * self.dt)
         self.fastest = max(self.fastest, float(np.abs(v).max()))
-        rows, normal, v = self._held_back(rows, normal, v)
-        b = -np.einsum("ij,ij->i", normal, v)
         # slower than the rounding of a place in half a step is at rest
-        if np.abs(b).max() > max(STILL * self.fastest, self.s * self.tolerance(x)):
-            self._strike(state, n, rows, normal, b)
+        self._halt(state, n, rows, normal, v, max(STILL * self.fastest, self.s * self.tolerance(x)))
 
-    def _strike(self, state: TissueState, n: int, rows: Rows, normal: Array, b: Array) -> None:
-        """Change the velocity of pressed nodes along normals (k, d) by b (k,) at the end of step n. Collective."""
-        free = self.hand is not None
-        u, momentum, y = stopping_impulse(self.system, self.surface, rows.node, normal, b, free, self.room)
-        self._kick(state, n, u, momentum)
-        table, impulse = self.table, y[:, None] * normal
-        np.add.at(table.impulse[n - 1], rows.obstacle, impulse)
-        table.force[n - 1] += table.impulse[n - 1] / self.dt
-        forces = np.zeros((self.p, self.d))
-        np.add.at(forces, rows.node, impulse)
-        table.hand[n - 1] += self.surface.T.T @ forces.ravel() / self.dt
-
-    def _kick(self, state: TissueState, n: int, u: Array, momentum: Array) -> None:
-        """Add a jump u of the velocity to tissue and hand. Collective."""
-        comm, rows = self.layout.comm, self.layout.n_local
-        G, drive, table = self.system.G, self.drive, self.table
-        assert drive is not None
-        jump, hand = u[:rows], u[rows:]
-        gained = momentum[:rows] - (G @ hand if len(hand) else 0.0)  # M u of the tissue, which its momentum takes up
-        mean = state.v.array_r + jump / 2
-        state.v.array_w[:] += jump
-        self.midpoint.r.array_w[:] += self.s * self.midpoint.operators.gather(gained)
-        if len(hand):
-            drive.v[n] += hand
-        sums = total(comm, np.concatenate([G.T @ jump, [mean @ gained, momentum[:rows] @ jump / 2]]))
-        table.kick[n - 1] = sums[:-2]
-        table.energy[0] += sums[-2]
-        table.energy[2] += sums[-1] + momentum[rows:] @ hand / 2
-
-    def _held_back(self, rows: Rows, normal: Array, v: Array) -> tuple[Rows, Array, Array]:
-        """Rows that stop at the end of a step, with their directions and velocities (k, d), from those pressed."""
-        return rows, normal, v
+    def _halt(self, state: TissueState, n: int, rows: Rows, normal: Array, v: Array, still: float) -> None:
+        """Stop rows with normals and velocities (k, d) unless all are slower than ``still``. Collective."""
+        b = -np.einsum("ij,ij->i", normal, v)
+        if np.abs(b).max() > still:
+            assert self.drive is not None
+            self.strike.stop(state, self.drive, n, rows.obstacle, rows.node, normal, b)
 
     # ---- what is left of a run
 
@@ -366,7 +341,8 @@ class Contact:
         """Record and sets of a restart file, see :class:`softgrasp.fem.run.checkpoint.RestartState`."""
         keys = self.responses.keys[: self.responses.count]
         parts: list[NDArray[Any]] = [
-            self.table.energy, np.array([self.fastest]), self.small.tally, keys.ravel(), *self._sets()
+            self.table.energy, np.array([self.fastest]), self.small.tally, keys.ravel(), self.strike.nodes(),
+            *self._sets(),
         ]  # fmt: skip
         sizes = np.array([len(parts), *(len(part) for part in parts)])
         return {"solver_rows": self.table.packed(self.n + 1), "solver_numbers": np.concatenate([sizes, *parts])}
@@ -379,9 +355,11 @@ class Contact:
         """Continue with what `restart_arrays` returned. Collective."""
         self.table.unpack(rows)
         count = 1 + int(numbers[0])
-        energy, fastest, tally, keys, *sets = np.split(numbers[count:], np.cumsum(numbers[1:count].astype(int)))[:-1]
+        ends = np.cumsum(numbers[1:count].astype(int))
+        energy, fastest, tally, keys, struck, *sets = np.split(numbers[count:], ends)[:-1]
         self.table.energy[:], self.fastest, self.small.tally[:] = energy, float(fastest[0]), tally
         self.responses.enter([(int(i), int(k)) for i, k in keys.reshape(-1, 2)])
+        self.strike.restore(struck.astype(int))
         self._resume(sets)
 
     def _resume(self, sets: list[Array]) -> None:
@@ -390,5 +368,5 @@ class Contact:
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
-        for vector in (self.b, self.y, *self.room):
+        for vector in (self.b, self.y):
             vector.destroy()

@@ -1,69 +1,111 @@
-"""The impulse that stops pressed nodes, on the mass matrix of tissue and hand."""
+"""Impulses on boundary nodes: M u = N'y for the jump u of the velocity of tissue and hand.
+
+With X = M^-1 G of a hand that feels the tissue, H = M_hand + M_rigid - G'X and B = N T - N X,
+
+    A = N M^-1 N' + B H^-1 B',   u = M^-1 N'y - X a,   a = H^-1 B'y.
+
+M is the same for every component, so that a node costs one column of its inverse for all directions.
+"""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_matrix
 
 from softgrasp.fem.model.surface import Surface
-from softgrasp.fem.obstacles.impulse import stop
-from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.fem.obstacles.compiled import RIDGE
+from softgrasp.fem.obstacles.mass import NodalMass
+from softgrasp.fem.petsc import Array, to_scipy, whole_copy
 from softgrasp.fem.system import BlockSystem
 
-RIDGE = 1e-13  # share of the diagonal that makes equal rows share their impulse [1]
+Ints = NDArray[np.intp]
 
 
-def stopping_impulse(
-    system: BlockSystem,
-    surface: Surface,
-    nodes: NDArray[np.intp],
-    normal: Array,
-    b: Array,
-    free: bool,
-    room: tuple[PETSc.Vec, PETSc.Vec],
-) -> tuple[Array, Array, Array]:
-    """Jump u of the velocity with N u = b and least energy, M u, and the impulses y of the rows, M u = N'y. Collective.
+class Impulses:
+    """What impulses on the boundary do. Making one is collective, and nothing else: every rank keeps the mass.
 
-    The owned rows of the tissue come first, then the hand where it is ``free`` and feels the tissue; there M has G and
-    M_hand + M_rigid as well, and N has N_s = N T. ``room``: two vectors of the tissue, overwritten.
+    Args:
+        system: of the run.
+        surface: its boundary.
+        free: whether the hand feels them.
     """
-    comm, n, (p, d) = system.layout.comm, system.layout.n_local, surface.X.shape
-    columns, k = (nodes[:, None] * d + np.arange(d)).ravel(), len(b)
-    N = csr_matrix((normal.ravel(), columns, np.arange(k + 1) * d), shape=(k, p * d))
-    M_s, N_s = (system.M_hand + system.M_rigid, N @ surface.T) if free else (np.zeros((0, 0)), np.zeros((k, 0)))
-    G = system.G if free else np.zeros((n, 0))
-    at, of = room
-    system.M_ee.getDiagonal(at)
-    diagonal = np.concatenate([at.array_r, np.diag(M_s)])
 
-    def multiply(u: Array) -> Array:
-        at.array_w[:] = u[:n]
-        system.M_ee.mult(at, of)
-        if not free:
-            return np.array(of.array_r)
-        return np.concatenate([of.array_r + G @ u[n:], total(comm, G.T @ u[:n]) + M_s @ u[n:]])
+    def __init__(self, system: BlockSystem, surface: Surface, free: bool) -> None:
+        layout, (_, d) = system.layout, surface.X.shape
+        self.d, self.surface, self.numbers = d, surface, surface.dofs[::d] // d
+        M = system.M_ee if layout.comm.size == 1 else whole_copy(system.M_ee)
+        one = to_scipy(M)[::d, ::d].tocsr()
+        if M is not system.M_ee:
+            M.destroy()
+        first = layout.start // d
+        self.mass = NodalMass(one, (first, first + layout.n_local // d))
+        self.n, self.n_s = layout.n_local, layout.n_s if free else 0
+        self.X, self.H = np.zeros((layout.n_local, 0)), np.zeros((0, 0))
+        self.reach, self.G = np.zeros((surface.X.size, 0)), system.G
+        if free:
+            self._couple(system)
+        self.key, self.A, self.factor = b"", np.zeros((0, 0)), (np.zeros((0, 0)), True)
 
-    def transpose(y: Array) -> Array:
-        result = np.zeros(n + len(M_s))
-        result[surface.rows] = (N.T @ y)[surface.mine]
-        result[n:] = N_s.T @ y
-        return result
+    def _couple(self, system: BlockSystem) -> None:
+        """Responses to the hand. Collective."""
+        from softgrasp.fem.petsc import rows_on_all, total  # few scenes need it
 
-    def dot(a: Array, b: Array) -> float:
-        return float(total(comm, np.array([a[:n] @ b[:n]]))[0] + a[n:] @ b[n:])
+        comm, d = system.layout.comm, self.d
+        G = rows_on_all(comm, system.G)
+        X = np.zeros_like(G)
+        every = np.arange(len(G) // d)
+        for j in range(G.shape[1]):
+            for axis in range(d):
+                nodes, values = self.mass.solve(every, np.ascontiguousarray(G[axis::d, j]))
+                X[nodes * d + axis, j] = values
+        first = system.layout.start
+        self.X = X[first : first + self.n]
+        self.H = system.M_hand + system.M_rigid - total(comm, system.G.T @ self.X)
+        self.reach = self.surface.T - X[self.surface.dofs]
 
-    invert = _inverse((N.multiply(1 / surface.gather(diagonal)) @ N.T).tocsr(), N_s / diagonal[n:] @ N_s.T)
-    return stop(multiply, diagonal, dot, lambda u: N @ surface.gather(u) + N_s @ u[n:], transpose, invert, b)
+    def matrix(self, nodes: Ints, directions: Array) -> Array:
+        """A (k, k) [1/kg] of unit impulses on boundary nodes (k,) along unit vectors (k, d); kept for the same ones.
 
+        Raises SolverError: a column of M^-1 does not converge.
+        """
+        key = nodes.tobytes() + directions.tobytes()
+        if key != self.key:
+            numbers = self.numbers[nodes]
+            self.mass.enter(numbers)
+            at = self.mass.where[numbers]
+            self.A = self.mass.block[np.ix_(at, at)] * (directions @ directions.T)
+            if self.n_s:
+                B = self._reach(nodes, directions)
+                self.A += B @ np.linalg.solve(self.H, B.T)
+            self.key, self.factor = key, (np.zeros((0, 0)), True)
+        return self.A
 
-def _inverse(small: csr_matrix, hand: Array) -> Callable[[Array], Array]:
-    """R -> (small + hand)^-1 r; small is diagonal where no node has two rows."""
-    diagonal = small.diagonal()
-    if small.nnz == len(diagonal) and not hand.any():
-        return lambda r: r / diagonal
-    factor = cho_factor(small.toarray() + hand + RIDGE * np.diag(diagonal), lower=True, overwrite_a=True)
-    return lambda r: np.asarray(cho_solve(factor, r, check_finite=False))
+    def _reach(self, nodes: Ints, directions: Array) -> Array:
+        """B, (k, n_s)."""
+        return np.asarray(np.einsum("ki,kij->kj", directions, self.reach.reshape(-1, self.d, self.n_s)[nodes]))
+
+    def stop(self, nodes: Ints, directions: Array, b: Array) -> Array:
+        """Impulses y (k,) [N s] with A y = b, b (k,) [m/s]; equal rows share them. Raises SolverError: see `matrix`."""
+        A = self.matrix(nodes, directions)
+        if not len(self.factor[0]):
+            ridged = A + RIDGE * np.diag(A.diagonal())
+            self.factor = cho_factor(ridged, lower=True, overwrite_a=True, check_finite=False)
+        y = cho_solve(self.factor, b, check_finite=False)
+        return np.asarray(y + cho_solve(self.factor, b - A @ y, check_finite=False))  # without the ridge's error
+
+    def jump(self, nodes: Ints, directions: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Jump of the velocity (n_local,) [m/s], that of the hand (n_s,), and what the momentum gains, M u (n_local,).
+
+        For impulses y (k,) [N s] on the nodes and directions of the last `matrix`.
+        """
+        total, at = np.zeros((len(self.mass.nodes), self.d)), self.mass.where[self.numbers[nodes]]
+        np.add.at(total, at, y[:, None] * directions)
+        u, gained = (self.mass.columns @ total).ravel(), np.zeros(self.n)
+        forces = np.zeros(self.surface.X.shape)
+        np.add.at(forces, nodes, y[:, None] * directions)
+        gained[self.surface.rows] = forces.ravel()[self.surface.mine]
+        if not self.n_s:
+            return u, np.zeros(0), gained
+        a = np.linalg.solve(self.H, self._reach(nodes, directions).T @ y)
+        return u - self.X @ a, a, gained - self.G @ a

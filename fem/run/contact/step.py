@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles.compiled import contact_library
-from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.contact.flat import FlatContact
 from softgrasp.fem.run.contact.general import Contact
+from softgrasp.fem.run.contact.touching import Touching
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive
 
@@ -30,29 +30,8 @@ class ContactDrive:
             self.contact.check_hand(self.drive, begin, end)
 
 
-class ContactMidpoint(TissueMidpoint):
-    """The tissue half of the step; ``contact`` acts at its end."""
-
-    contact: Contact
-
-    def advance(self, old: TissueState, new: TissueState) -> None:
-        """Write the new state, carry k and r on, and stop what is pressed. Collective."""
-        super().advance(old, new)
-        self.contact.finish(new)
-
-    def restart_arrays(self) -> dict[str, Array]:
-        """Further arrays of a restart file: the record and the set of pressed nodes."""
-        return self.contact.restart_arrays()
-
-    def restore(self, rows: Array | None, numbers: Array | None) -> None:
-        """Continue with what `restart_arrays` returned, after `adopt`. Collective."""
-        if rows is not None and numbers is not None:
-            self.contact.restore(rows, numbers)
-
-    def destroy(self) -> None:
-        """Free all PETSc objects. Collective."""
-        self.contact.destroy()
-        super().destroy()
+class ContactMidpoint(Touching):
+    """The linear step; ``contact`` acts at its end."""
 
 
 def make_contact(
@@ -62,17 +41,28 @@ def make_contact(
 
     Raises SoftgraspError: a path of an obstacle does not fit, or the prescribed hand itself meets an obstacle.
     """
-    assert isinstance(midpoint, ContactMidpoint)
+    assert isinstance(midpoint, Touching)
     hand = drive.step if isinstance(drive, ForceDrive) and model.system.two_way else None
     obstacles = model.scene.obstacle or []
     kind: type[Contact] = Contact
-    if any(entry.friction for entry in obstacles):
-        from softgrasp.fem.run.contact.friction import FrictionContact  # only scenes with friction pay for it
+    if model.system.points is not None:
+        from softgrasp.fem.run.contact.finite import FiniteContact  # only scenes with finite strain pay for it
 
-        kind = FrictionContact
-    elif {entry.kind for entry in obstacles} == {"halfspace"} and contact_library() is not None:
+        midpoint.contact = FiniteContact(model, midpoint, steps, hand)
+        return _checked(drive, midpoint.contact, steps)
+    flat = {entry.kind for entry in obstacles} == {"halfspace"} and contact_library() is not None
+    if any(entry.friction for entry in obstacles):
+        from softgrasp.fem.run.contact import friction  # only scenes with friction pay for it
+
+        kind = friction.FlatFriction if flat else friction.FrictionContact
+    elif flat:
         kind = FlatContact
     midpoint.contact = kind(model, midpoint, steps, hand)
+    return _checked(drive, midpoint.contact, steps)
+
+
+def _checked(drive: TableDrive | ForceDrive, contact: Contact, steps: int) -> tuple[ContactDrive, Contact]:
+    """Drive and contact; the prescribed hand meets no obstacle. Raises SolverError: it does."""
     if isinstance(drive, TableDrive):
-        midpoint.contact.check_hand(drive, 0, steps + 1)
-    return ContactDrive(drive, midpoint.contact), midpoint.contact
+        contact.check_hand(drive, 0, steps + 1)
+    return ContactDrive(drive, contact), contact

@@ -1,0 +1,132 @@
+"""Contact at finite strain: forces x on the boundary are one more load of the step.
+
+    R(w) = (s^2 M + s D) w + f_alg(z_n, w) - s pi_n - G c - N'x = 0,   0 <= x,  g_{n+1} >= 0,  x'g_{n+1} = 0.
+
+A round solves the small problem with W = N S^-1 N' of the tangent S that the step has, from the gaps of the last round,
+and the step under the new forces; the responses are made anew where the tangent was. Forces do the work 2 x'Nw, as in
+the linear step, and the step has w'R = 0, so that the balance of energy closes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.contact.general import MOST, Contact, unsettled
+from softgrasp.fem.run.contact.rows import Rows
+from softgrasp.fem.run.contact.touching import Touching
+from softgrasp.fem.run.finite_strain import FiniteStrainMidpoint
+from softgrasp.fem.run.midpoint import Feedback
+from softgrasp.fem.run.motion import ForceDrive, TableDrive
+
+BALANCED = 8  # rounds that move w to w'R = 0; near rest, where w'R is no work to speak of, this would not end
+CLOSE = 1e-13  # of the body: gaps of pressed nodes at the end of the rounds [1]
+
+
+class FiniteContactMidpoint(Touching, FiniteStrainMidpoint):
+    """The step of finite strain; ``contact`` acts at its end."""
+
+    def solve_midpoint(self, c: Array, feedback: Feedback | None = None) -> None:
+        """See :meth:`FiniteStrainMidpoint.solve_midpoint`. Collective."""
+        super().solve_midpoint(c, feedback)
+        self.free_load = self.right
+
+    def press(self, pressing: Array, change: Array, balanced: bool) -> None:
+        """Solve the step anew from w + change under further forces on the rows here. Collective.
+
+        ``balanced``: with w'R = 0 also where w + change is a solution to the tolerance already.
+
+        Raises SolverError: no convergence.
+        """
+        if self.jump is not None:
+            raise SolverError(
+                "contact at finite strain cannot act in a step that is divided into substeps; take more time.steps"
+            )
+        self.right = self.free_load + pressing
+        root = self._find(self.w_array + change)
+        if root.iterations < 0:
+            raise SolverError(
+                f"contact at finite strain ({self.body.law.name}): the step does not converge under the forces of the "
+                "obstacles; take more time.steps or a gentler motion"
+            )
+        counts = self.counts
+        counts.iterations += root.iterations
+        counts.most = max(counts.most, root.iterations)
+        moved = self._balance(root) if balanced and root.iterations == 0 else None  # else it has w'R = 0 already
+        self.w.array_w[:] = root.x if moved is None else moved
+
+
+class FiniteContact(Contact):
+    """`Contact` of one run at finite strain, under a hand that feels no tissue."""
+
+    midpoint: FiniteContactMidpoint
+
+    def _settle(self, n: int, x0: Array, free: Array) -> tuple[Array, Rows]:
+        """See :meth:`Contact._settle`. Collective."""
+        midpoint, tol = self.midpoint, max(self.tolerance(free), CLOSE * self.layout.extent)
+        known, before = self.after < 0, self._make_rows(np.zeros((0, 2), dtype=int))
+        known[self.rows.obstacle, self.rows.node] = True
+        active = known & False
+        active[self.rows.obstacle, self.rows.node] = True
+        x1, pressing = free, np.zeros_like(midpoint.r_array)
+        for count in range(MOST):
+            self._refresh()
+            rows = self._make_rows(np.argwhere(known))
+            at = rows.obstacle, rows.node
+            q = self._look_along(rows, n, x0, x1, x1)
+            C = self.select(self.responses, np.argwhere(known), rows.normal)
+            m = C.shape[1]
+            W = C @ self.responses.G[:m, :m] @ C.T
+            self.small.restart(W, np.flatnonzero(active[at]))
+            f0 = self._strengths(before, m)
+            rows.x = self.small.solve(len(q), W, q - C @ self.responses.G[:m, :m] @ f0, tol / 4).copy()
+            f = C.T @ rows.x
+            pressing[self.places] = self.responses.forces(f)[self.order]
+            midpoint.press(pressing, self.responses.columns[:, :m] @ (f - f0), count < BALANCED)
+            before, pressed = rows, rows.x > 0
+            active[:] = False
+            active[rows.obstacle[pressed], rows.node[pressed]] = True
+            x1 = x0 + self._way(n)
+            self.after = self._gaps(x1, n + 1)
+            new = (self.after < -tol) & ~known
+            reached = np.abs(self.after[at])[pressed].max(initial=0.0)
+            if not new.any() and reached <= tol:
+                return f, rows.take(pressed)
+            known |= new
+        raise unsettled(float(reached))
+
+    def _strengths(self, rows: Rows, m: int) -> Array:
+        """Strengths (m,) of the responses in the forces of rows."""
+        if not len(rows.node):
+            return np.zeros(m)
+        C = self.select(self.responses, np.stack([rows.obstacle, rows.node], axis=1), rows.normal)
+        return np.asarray(C.T @ rows.x)
+
+    def _way(self, n: int) -> Array:
+        """Motion of the boundary nodes in the step, hand included, (p, d) [m]. Collective."""
+        assert self.drive is not None
+        z = 2 * self._take(self.midpoint.w_array) + self.surface.T @ (self.drive.q[n + 1] - self.drive.q[n])
+        return np.asarray(z.reshape(self.p, self.d))
+
+    def _refresh(self) -> None:
+        """Make all responses anew where the tangent is another one. Collective."""
+        if self.factors != (count := self.midpoint.counts.factors):
+            keys = [(int(i), int(k)) for i, k in self.responses.keys[: self.responses.count]]
+            self.responses, self.factors = self._make_responses(), count
+            self.responses.enter(keys)
+
+    factors = 0  # tangents factored when the responses were made
+
+    def _add(self, n: int, f: Array, drive: TableDrive | ForceDrive) -> None:
+        """See :meth:`Contact._add`; the step has the forces already. Collective."""
+        self.forces = self.responses.forces(f)
+        self.moved = self._take(self.midpoint.w_array)
+
+    def _carry(self) -> None:
+        """See :meth:`Contact._carry`: r is the momentum alone here, which w has taken on."""
+
+    def restore(self, rows: Array, numbers: Array) -> None:
+        """See :meth:`Contact.restore`. Collective."""
+        self.factors = self.midpoint.counts.factors
+        super().restore(rows, numbers)

@@ -1,0 +1,81 @@
+"""Contact at finite strain: balance, penetration, restart, the linear limit, forces that carry the weight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softgrasp.fem.errors import Paused
+from softgrasp.fem.model.build import build
+from softgrasp.fem.run.simulate import RunOptions, simulate
+
+FALL = [
+    "tissue.cells=[4, 8]", "motion={profile='hold'}", "effects.gravity={g=[0, -5]}", "time.steps=50", "time.end=0.5",
+    "effects.finite_strain={}",
+]  # fmt: skip
+ON = "effects.obstacles=true"
+BETA = "effects.damping={kind='kelvin-voigt', beta=0.01}"
+
+
+def table(offset: float) -> str:
+    return f"obstacle=[{{kind='halfspace', normal=[0, 1], offset={offset}}}]"
+
+
+DISC = "obstacle=[{kind='disc', center=[0.4, -0.53], radius=0.5}]"
+BOX = "obstacle=[{kind='box', lo=[0.1, -0.53], hi=[2, -0.03], path={velocity=[0, 0.02]}}]"
+
+
+def run(*overrides: str, **options: Any) -> Any:
+    return simulate(build("paper_forward", [*FALL, *overrides]), **options)
+
+
+@pytest.mark.ranks(2)
+@pytest.mark.parametrize("overrides", [[table(-0.03)], [DISC, BETA], [BOX, BETA]])
+def test_balance_closes_without_penetration(overrides: list[str]) -> None:
+    result = run(ON, *overrides)
+    assert result.contact.touching.max() > 0
+    assert result.energy_drift < 3e-12  # each step has w'R = 0 to about 1e-14; measured 1e-16 to 3e-13
+    assert result.contact.penetration < 2 * 1e-12  # rounds end at 1e-13 of the body, of size 2
+    assert result.contact.stopped > 0
+    assert result.newton.substepped == 0
+
+
+def test_never_touched_is_the_run_without_contact_bit_for_bit() -> None:
+    far, without = run(ON, table(-10.0), "time.steps=20"), run("time.steps=20")
+    assert far.contact.columns == 0
+    for name in ("outputs", "final", "force"):
+        assert np.array_equal(getattr(far, name), getattr(without, name))
+
+
+def test_restart_in_contact_repeats_the_bits(mpi_tmp_path: Path) -> None:
+    overrides = [*FALL, ON, table(-0.03)]  # undamped: tangents are factored anew on the way
+    whole = simulate(build("paper_forward", overrides))
+    with pytest.raises(Paused):
+        simulate(build("paper_forward", overrides), RunOptions(mpi_tmp_path, until=30))
+    again = simulate(build("paper_forward", overrides), RunOptions(mpi_tmp_path, resume=True))
+    assert whole.contact.touching[:30].max() > 0
+    assert whole.newton.factors > 0
+    assert np.array_equal(again.final, whole.final)
+    for name in ("force", "impulse", "gap", "touching"):
+        assert np.array_equal(getattr(again.contact, name), getattr(whole.contact, name))
+    assert again.energy_drift == whole.energy_drift
+
+
+def test_small_loads_give_the_linear_run() -> None:
+    small = ["effects.gravity={g=[0, -5e-4]}", table(-3e-6), ON, BETA]
+    nonlinear, linear = run(*small), run(*small, "effects.finite_strain=false")
+    scale = np.abs(linear.final).max()
+    # strains of 1e-5, and the tolerance of Newton's method
+    assert np.abs(nonlinear.final - linear.final).max() < 1e-3 * scale
+    assert nonlinear.contact.force[:, 0, 1].max() == pytest.approx(linear.contact.force[:, 0, 1].max(), rel=1e-3)
+
+
+def test_table_and_hand_carry_the_weight_at_rest() -> None:
+    damped = "effects.damping={kind='rayleigh', alpha=4.0, beta=0.05}"
+    result = run(ON, table(-0.03), damped, "time.steps=200", "time.end=16")
+    weight = build("paper_forward", FALL).system.M_rigid[1, 1] * 5
+    assert result.force[-1, 1] + result.contact.force[-1, 0, 1] == pytest.approx(weight, rel=1e-5)  # left of the motion
+    assert result.contact.force[-1, 0, 1] > 0.05 * weight
