@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from softgrasp.fem.model.refined import scene_ends
     from softgrasp.fem.model.scales import SMALL_STRAIN, rigid_inertia
     from softgrasp.fem.obstacles import Ball, HalfSpace, Obstacle, Polytope, Shape
-    from softgrasp.fem.owned import note, remove_own
+    from softgrasp.fem.owned import follow, note, remove_own
     from softgrasp.fem.petsc import PETSc, on_root, total
     from softgrasp.fem.reduced import ReducedSystem
     from softgrasp.fem.resources import free_memory, size_text
@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from softgrasp.fem.solve.costs import STEP_RTOL
     from softgrasp.fem.solve.modes import lowest_modes
     from softgrasp.fem.solve.solvers import ITERATIVE
+    from softgrasp.fem.solve.stiffness import sharing_factors
     from softgrasp.fem.system import BlockSystem
 else:
     __getattr__, __dir__ = face(__name__)

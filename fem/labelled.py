@@ -21,7 +21,7 @@ class Quantity:
     values: Array  # (times, components)
     labels: tuple[str, ...]  # labels of the components, (components,)
     units: tuple[str, ...]  # units of the components, (components,)
-    dimension: str  # kind of the components: "output" or "hand"
+    dimension: str  # kind of the components: "output" or "hand"; empty for a quantity without components
     mid: bool = False  # whether a row is at the middle of a step: one row less than the times
 
 
@@ -34,6 +34,11 @@ def package(name: str) -> Any:
         return import_module(name)
     except ImportError as error:
         raise SoftgraspError(f"{name} is not installed; `pip install 'softgrasp[data]'` brings it") from error
+
+
+def of_energy(values: Array) -> Quantity:
+    """An energy over time, (times,)."""
+    return Quantity(values[:, None], ("",), ("J",), "")
 
 
 def of_hand(values: Array, names: Sequence[str], *, rate: str = "", load: bool = False) -> Quantity:
@@ -78,6 +83,9 @@ class Labelled(ABC):
             row = "midpoint" if q.mid else "time"
             if q.mid:
                 coordinates[row] = (row, (self.times[1:] + self.times[:-1]) / 2, {"units": "s"})
+            if not q.dimension:
+                data[name] = ((row,), q.values[:, 0], {"units": q.units[0]})
+                continue
             coordinates[q.dimension] = (q.dimension, list(q.labels), {})
             units = q.units[0] if len(set(q.units)) == 1 else list(q.units)
             data[name] = ((row, q.dimension), q.values, {"units": units})
@@ -95,7 +103,7 @@ class Labelled(ABC):
         for name, q in self.quantities.items():
             values = np.vstack([np.full((1, q.values.shape[1]), np.nan), q.values]) if q.mid else q.values
             for j, (label, unit) in enumerate(zip(q.labels, q.units, strict=True)):
-                columns[f"{name} {label} [{unit}]"] = values[:, j]
+                columns[f"{f'{name} {label}'.strip()} [{unit}]"] = values[:, j]
         return pandas.DataFrame(columns, index=pandas.Index(self.times, name="time [s]"))
 
 
@@ -114,6 +122,10 @@ class FullOrderRun(Labelled):
     """Displacement of the hand, (steps + 1, n_s) [m, rad]."""
     v_s: Array
     """Velocity of the hand, (steps + 1, n_s) [m/s, rad/s]."""
+    energy: Array
+    """Energy of the deformation, (steps + 1,) [J]."""
+    dissipated: Array
+    """Energy that damping has taken, (steps + 1,) [J]."""
 
     @property
     def output_names(self) -> tuple[str, ...]:
@@ -122,7 +134,7 @@ class FullOrderRun(Labelled):
 
     @property
     def quantities(self) -> dict[str, Quantity]:
-        """Outputs, hand and its force over time with their labels and units."""
+        """Outputs, hand, its force and energies over time with their labels and units."""
         names = self.output_names
         return {
             "outputs": of_columns(self.outputs, self.columns, "output"),
@@ -130,6 +142,8 @@ class FullOrderRun(Labelled):
             "q_s": of_hand(self.q_s, names),
             "v_s": of_hand(self.v_s, names, rate="/s"),
             self.LOAD: of_hand(getattr(self, self.LOAD), names, load=True),
+            "energy": of_energy(self.energy),
+            "dissipated": of_energy(self.dissipated),
         }
 
 

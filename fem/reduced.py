@@ -12,11 +12,11 @@ from importlib import import_module
 from typing import Any, Self
 
 import numpy as np
-from mpi4py import MPI
 
 from softgrasp.fem.columns import TURNS, Columns, hand_of
 from softgrasp.fem.errors import SoftgraspError, SolverError
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.pymor import operator, port, pymor_models
 from softgrasp.fem.shown import Card, Shown, drawn, listed
 
 STEPS = 8  # in one product: more would not gain at N = 30, where a product needs the time of the call
@@ -287,16 +287,12 @@ class ReducedSystem(StateSpace):
         return primitives.LinearSystem(steps[:, : self.N], steps[:, self.N : -1], self.C, D, dt)
 
     def to_pymor(self) -> Any:
-        """The system as ``pymor.models.iosys.LTIModel``, in programs of one rank.
+        """The system as ``pymor.models.iosys.LTIModel``, without its constant load, in programs of one rank.
 
-        Raises ReducedSystemError: pyMOR is not installed, or the program runs on several ranks.
+        The operators B and C are called as their columns and rows, with units.
+
+        Raises SoftgraspError: pyMOR is not installed, or the program runs on several ranks.
         """
-        if MPI.COMM_WORLD.size > 1:  # importing pyMOR would put all ranks but the first into an event loop of its own
-            raise ReducedSystemError(
-                f"to_pymor runs on one rank, not on {MPI.COMM_WORLD.size}; save the model and load it there"
-            )
-        try:
-            from pymor.models.iosys import LTIModel
-        except ImportError as error:
-            raise ReducedSystemError("pyMOR is not installed; `pip install pymor` brings it") from error
-        return LTIModel.from_matrices(self.A, self.B, self.C, E=self.E)
+        models = pymor_models()
+        E, A = (operator([((), 0, X)], 1, name) for X, name in ((self.E, "E"), (self.A, "A")))
+        return models.LTIModel(A, port(self.B, self.inputs), port(self.C, self.outputs), E=E, name=type(self).__name__)

@@ -14,12 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from softgrasp.fem.errors import SceneError
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.material import LayerMaterial
+from softgrasp.fem.material import LayerMaterial, differs, of_layers
 from softgrasp.fem.petsc import Array, PETSc, combine, times_columns, total
 from softgrasp.fem.shown import Shown
 
-if TYPE_CHECKING:  # only scenes with finite strain load it
+if TYPE_CHECKING:  # only scenes with finite strain, an own energy or the frame of a turning hand load them
+    from softgrasp.fem.energy.layers import LayerEnergy
+    from softgrasp.fem.frame.integrals import FrameIntegrals
     from softgrasp.fem.strain.points import QuadraturePoints
 
 
@@ -85,13 +88,15 @@ class BlockSystem(Shown):
     two_way: bool = False  # whether the tissue acts on the hand
     graded: bool = False  # whether cell sizes vary so much that Euclidean norms of node values mean little
     points: QuadraturePoints | None = None  # quadrature points of the finite-strain law; None: linear, force K_ee z
+    energy: LayerEnergy | None = None  # own energy of the tissue; None: a built-in law
+    frame: FrameIntegrals | None = None  # integrals of a hand that turns by any angle; None: equations of small angles
     # factor and modes of K_ee, made on the first request (softgrasp.fem.solve.stiffness, softgrasp.fem.solve.modes)
     kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def contrast(self) -> float:
         """Largest lambda / mu of the materials [1]: 49 at nu = 0.49."""
-        return max(m.lam / m.mu for m in self.materials)
+        return max(m.lam / m.mu for m in of_layers(self.materials))
 
     @property
     def fall(self) -> Array:
@@ -123,7 +128,12 @@ class BlockSystem(Shown):
                 component.ee.destroy()
 
     def with_materials(self, materials: tuple[LayerMaterial, ...]) -> BlockSystem:
-        """The same scene with other lambda, mu, rho, beta: a few axpy, no assembly. Collective."""
+        """The same scene with other lambda, mu, rho, beta: a few axpy, no assembly. Collective.
+
+        Raises SceneError: a parameter of an own energy changes that the stiffness is not affine in.
+        """
+        if text := differs(materials, self.materials):
+            raise SceneError(text)
         M_ee, K_ee = tissue_matrices(self.layers, materials)
         G, M_rigid = coupling(self.layers, materials, self.T)
         matrix = layered_viscosity(self.layers, materials)

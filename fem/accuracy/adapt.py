@@ -34,6 +34,25 @@ GUESSED = 0.7  # least reduction that a pass aims at: too many cells need more t
 LINE_TRIES, LINE_STEP = 12, 0.7  # the number of lines grows with a small power of the tolerance
 
 
+def _with_own(scene: Scene, comm: MPI.Intracomm, mesh: Any, tags: tuple[Any, Any], energy: Any, terms: Any) -> Scene:
+    """The scene with what `build` was given in Python; only those who give it pay for it. Collective."""
+    if mesh is not None and not isinstance(mesh, TissueMesh):
+        from softgrasp.fem.mesh.given import with_given_mesh
+
+        scene = with_given_mesh(scene, comm, mesh, *tags)
+    if energy is not None:
+        from softgrasp.fem.energy.own import with_energy
+
+        with raise_on_all_ranks(comm):
+            scene = with_energy(scene, energy)
+    if terms:
+        from softgrasp.fem.model.terms import with_terms
+
+        with raise_on_all_ranks(comm):
+            scene = with_terms(scene, terms)
+    return scene
+
+
 def build(
     scene: Scene | str | Path,
     overrides: Sequence[str] = (),
@@ -42,6 +61,8 @@ def build(
     mesh: TissueMesh | Any = None,
     cell_tags: Any = None,
     facet_tags: Any = None,
+    energy: Any = None,
+    terms: Sequence[Any] = (),
     steps: bool = True,
     **tables: Any,
 ) -> Model:
@@ -58,6 +79,11 @@ def build(
             (:func:`softgrasp.fem.mesh.given.with_given_mesh`); a `TissueMesh` as it is; None makes that of the scene.
         cell_tags: marks of the cells of a DOLFINx mesh, (`dolfinx.mesh.MeshTags`), for ``tissue.layers.NAME.tag``.
         facet_tags: marks of its facets, for ``contact.facet_tag``.
+        energy: W(F, p), energy per volume of the rest state [J/m^3] in UFL, instead of ``tissue.energy``: F is the
+            deformation gradient, p has ``mu`` and ``lam`` of the material, the names of ``tissue.parameters``, the
+            place ``x`` at rest and the dimension ``d``. Its tangent at rest is K; with ``effects.finite_strain`` it
+            is the law.
+        terms: own terms of the stiffness, :class:`softgrasp.fem.model.terms.Term` each.
         steps: whether the time steps have to carry the tolerance too: those of the scene's own run.
 
     Raises:
@@ -74,11 +100,13 @@ def build(
     """
     begin = time.perf_counter()
     keys = [*overrides, *as_overrides(tables)]
-    if mesh is not None and not isinstance(mesh, TissueMesh):
-        from softgrasp.fem.mesh.given import with_given_mesh  # only given meshes pay for it
-
-        scene = load_scene_collective(comm, scene, keys) if isinstance(scene, str | Path) else scene
-        scene, keys, mesh = with_given_mesh(scene, comm, mesh, cell_tags, facet_tags), [], None
+    given = mesh is not None and not isinstance(mesh, TissueMesh)
+    if given or energy is not None or terms:
+        if isinstance(scene, str | Path):  # else keys are refused below, as beside every scene that is loaded
+            # without an energy the parameters of one are refused
+            named = [] if energy is None else ['tissue.energy="given"']
+            scene, keys = load_scene_collective(comm, scene, [*keys, *named]), []
+        scene, mesh = _with_own(scene, comm, mesh, (cell_tags, facet_tags), energy, terms), None if given else mesh
     model = build_on(scene, keys, comm, mesh=mesh)
     scene, refine = model.scene, model.scene.tissue.refine
     if refine is None or refine.tolerance is None or refine.passes == 0 or mesh is not None:

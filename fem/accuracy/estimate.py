@@ -195,6 +195,8 @@ def like(model: Model, scene: Scene, mesh: TissueMesh | None = None) -> Model:
 
     layers = {k: part.model_copy(update={"material": material(k, part.material)}) for k, part in tissue.layers.items()}
     tissue = tissue.model_copy(update={"layers": layers, "material": material("tissue", tissue.material)})
+    if system.energy is not None:
+        tissue = tissue.model_copy(update=system.energy.tables(tissue, system.materials))
     effects = scene.effects.model_copy(update={"finite_strain": None})
     scene = scene.model_copy(update={"tissue": tissue, "effects": effects})
     other = build(scene, comm=system.layout.comm, mesh=mesh)
@@ -294,7 +296,7 @@ def cell_products(model: Model, X: Array) -> Array:
     """Elastic energy products k_T(x_i, x_j) of columns on the owned cells, (cells, k, k). Collective."""
     V, d, tissue = model.space.V, model.space.mesh.dimension, model.space.mesh
     lam, mu = np.array([(m.lam, m.mu) for m in model.system.materials])[model.space.layer].T
-    cells = tissue.owned
+    cells, own = tissue.owned, model.system.energy
     element = V.element.basix_element
     points, weights = basix.make_quadrature(element.cell_type, max(2 * (element.degree - 1), 1))
     scale = np.abs(np.linalg.det(tissue.edges))[:, None] * weights * model.scene.tissue.thickness
@@ -305,6 +307,11 @@ def cell_products(model: Model, X: Array) -> Array:
     E = np.zeros((cells, X.shape[1], X.shape[1]))
     for q in range(len(weights)):  # one point at a time: gradients of all at once would be large
         gradient = np.einsum("cnb,cnik->cibk", model.space.gradients(points[q : q + 1])[:, 0], u, optimize=True)
+        if own is not None:
+            X = tissue.vertices[:, 0] + points[q] @ tissue.edges
+            moduli = own.at_rest(model.system.materials, model.space.layer, X) * scale[:, q]
+            E += np.einsum("cibk,ibjac,cjal->ckl", gradient, moduli, gradient, optimize=True)
+            continue
         strain = (gradient + np.swapaxes(gradient, 1, 2)) / 2
         flat = strain.reshape(cells, d * d, -1)
         trace = np.einsum("ciik->ck", strain)

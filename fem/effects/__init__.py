@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from softgrasp.fem.effects.damping import DampingEffect
 from softgrasp.fem.effects.finite_strain import FiniteStrainEffect
+from softgrasp.fem.effects.frame import FrameEffect
 from softgrasp.fem.effects.gate import Effect, Gate, Problem
 from softgrasp.fem.effects.gravity import GravityEffect
 from softgrasp.fem.effects.layers import LayersEffect
@@ -18,6 +19,7 @@ _ALL = (
     DampingEffect(),
     ReactionEffect(),
     RotationEffect(),
+    FrameEffect(),
     LayersEffect(),
     FiniteStrainEffect(),
     ObstaclesEffect(),

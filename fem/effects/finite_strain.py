@@ -34,7 +34,7 @@ class FiniteStrainEffect(Effect):
         scene, number = problem.scene, linear_error(problem.response.rms, problem.dimension)
         symbol = f"{SLOPE[problem.dimension]:g} rms|grad z| of the static response"
         condition = ""
-        if scene.effects.rotation and not self.active(scene):
+        if scene.effects.rotation and scene.effects.frame is None and not self.active(scene):
             condition = "cannot be tried beside effects.rotation"
             sentence = f"Off; linear elasticity would have an error of about {number:.2g} of the deformation; "
             sentence += "the linearised rotation does not go with finite strain."

@@ -62,7 +62,7 @@ class Gate:
 class Problem:
     """Scales of one scene; `fem.model.scales` computes them."""
 
-    scene: Scene
+    scene: Scene  # scene of the problem
     dimension: int  # 2 or 3
     length: float  # largest extent of the tissue [m]
     materials: tuple[LayerMaterial, ...]  # materials, one per layer that has cells

@@ -7,6 +7,7 @@ import numpy as np
 from softgrasp.fem.effects.gate import SMALL_SHARE, Effect, Gate, Problem
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.shown import percent
 
 EARTH = 9.81  # [m/s2], assumed when the scene has no gravity
 
@@ -32,11 +33,13 @@ class GravityEffect(Effect):
         off, sag, length = problem.scene.effects.gravity is None, problem.sag, problem.length
         number = sag.gradient.typical
         bends = f"sag by {sag.largest:.2g} m, {sag.largest / length:.2g} of its length {length:.3g} m"
-        steep = f"|grad z| is at most {number:.2g} in {1 - SMALL_SHARE:.0%} of the body"
+        steep = f"|grad z| is at most {number:.2g} in {percent(1 - SMALL_SHARE)} of the body"
         begin = (
             f"Off; in SI units and with g = {EARTH} the tissue would" if off else "Under its weight the tissue would"
         )
-        holds = "holds" if sag.gradient.linear else f"does not hold, {sag.gradient.share:.0%} of the body is above 0.1"
+        holds = (
+            "holds" if sag.gradient.linear else f"does not hold, {percent(sag.gradient.share)} of the body is above 0.1"
+        )
         sentence = f"{begin} {bends}, by linear elasticity; {steep}: the theory {holds}."
         proviso = "if its numbers are in SI units" if off else ""
         return Gate(number, "|grad z| of its sag", self.threshold, number > self.threshold, sentence, proviso)

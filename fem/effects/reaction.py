@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from softgrasp.fem.effects.gate import Effect, Gate, Problem, force_drives
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.shown import percent
 
 
 class ReactionEffect(Effect):
@@ -28,9 +29,13 @@ class ReactionEffect(Effect):
         on, driven = self.active(scene), force_drives(scene)
         where = "" if scene.motion.drive == "force" else " in the control problem"
         if driven and on:
-            sentence = f"The tissue reduces the acceleration of the hand under a force by about {change:.1%}{where}."
+            sentence = (
+                f"The tissue reduces the acceleration of the hand under a force by about {percent(change)}{where}."
+            )
         elif driven:
-            sentence = f"Off; it would reduce the acceleration of the hand under a force by about {change:.1%}{where}."
+            sentence = (
+                f"Off; it would reduce the acceleration of the hand under a force by about {percent(change)}{where}."
+            )
         else:
             sentence = "The motion of the hand is prescribed, so the reaction moves nothing."
         proviso = where.removeprefix(" ") if driven else ""

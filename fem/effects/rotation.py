@@ -28,7 +28,7 @@ def hand_mass(scene: Scene, d: int) -> Array:
 
 
 class RotationEffect(Effect):
-    """d (d - 1) / 2 linearised rotations in q_s."""
+    """d (d - 1) / 2 rotations in q_s, linearised unless ``effects.frame`` is given."""
 
     name = "rotation"
     term = "d (d-1)/2 small angles in q_s: as many columns more in R, T and G, the hand's inertia in M_ss"

@@ -33,6 +33,7 @@ class PictureMesh:
     reference: Array  # point the hand turns about [m], shape (d,)
     n_s: int  # number of degrees of freedom of the hand [1]
     obstacles: tuple[Obstacle, ...] = ()  # what the tissue may touch
+    turning: bool = False  # whether the hand turns by any angle, by rotation vectors
 
     @property
     def dimension(self) -> int:
@@ -43,7 +44,18 @@ class PictureMesh:
         """Displacement R q_s of points that move with the hand, shape (n, d) [m]; the vertices by default."""
         x = self.points if points is None else points
         modes = rigid_modes(x, self.dimension, self.n_s > self.dimension, self.reference)
-        return np.asarray(modes @ np.asarray(q_s, dtype=np.float64)).reshape(len(x), self.dimension)
+        linear = np.asarray(modes @ np.asarray(q_s, dtype=np.float64)).reshape(len(x), self.dimension)
+        if not self.turning:
+            return linear
+        from softgrasp.fem.frame.rotation import Pose  # only such scenes pay for it
+
+        return Pose.of(np.asarray(q_s, dtype=np.float64), self.dimension).rigid(linear)
+
+    def path(self, table: Array, point: Array) -> Array:
+        """Places of a point that moves with the hand, (steps, d) [m], for its motion (steps, n_s) [m, rad]."""
+        if self.turning:
+            return np.array([point + self.rigid(q, point[None, :])[0] for q in table])
+        return np.asarray(point + table @ np.vstack([self.rigid(unit, point[None, :]) for unit in np.eye(self.n_s)]))
 
 
 def gather_picture(model: Model) -> PictureMesh | None:
@@ -76,8 +88,9 @@ def gather_picture(model: Model) -> PictureMesh | None:
 
         obstacles = make_obstacles(model.scene, layout.dimension)
     return PictureMesh(
-        points, cells, facets, contact, layers, model.space.layers, layout.reference, layout.n_s, obstacles
-    )
+        points, cells, facets, contact, layers, model.space.layers, layout.reference, layout.n_s, obstacles,
+        model.system.frame is not None,
+    )  # fmt: skip
 
 
 def vertex_displacement(model: Model, z: Array, q_s: Array) -> Array | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import dolfinx.la
 import dolfinx.plot
@@ -102,15 +103,17 @@ class SeriesWriter:
         self.list = Collection(self.file, self.run)
 
     def _fields(self, z: Array, v: Array, q_s: Array, v_s: Array | None) -> tuple[list[Field], list[Field]]:
-        def of_nodes(z: Array, q_s: Array) -> Array:
-            return np.asarray(self.model.displacement(z, q_s).x.array.reshape(-1, self.d))
+        def of_nodes(function: Any) -> Array:
+            return np.asarray(function.x.array.reshape(-1, self.d))
 
-        u = of_nodes(z, q_s)
-        strain, stress, mises = (values.astype(np.float32, order="C") for values in self.stress(u))
+        u = of_nodes(self.model.displacement(z, q_s))
+        # in the frame of a turning hand strain and stress are those of z, in the axes of the hand
+        strained = u if self.model.system.frame is None else of_nodes(self.model.space.nodal(z))
+        strain, stress, mises = (values.astype(np.float32, order="C") for values in self.stress(strained))
         cells = [Field("strain", "1", strain), Field("stress", "Pa", stress), Field("von_mises", "Pa", mises)]
         points = [Field("displacement", "m", self._points(u))]
         if v_s is not None:
-            points.append(Field("velocity", "m/s", self._points(of_nodes(v, v_s))))
+            points.append(Field("velocity", "m/s", self._points(of_nodes(self.model.velocity(z, v, q_s, v_s)))))
         return [*points, self.held], [*cells, self.layer]
 
     def _points(self, values: Array) -> npt.NDArray[np.float32]:

@@ -19,7 +19,8 @@ VOIGT = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 class CellStress:
     """Strain and stress in the owned cells of a model; exact for P1, of the midpoint for P2 and P3.
 
-    In 2D the strain is plane: eps_zz = 0, sigma_zz as it must be for that.
+    In 2D the strain is plane: eps_zz = 0, sigma_zz as it must be for that. An own energy says it if
+    its W holds in 3D too; else sigma_zz and the von Mises stress are NaN.
 
     Attributes:
         layer: number of the layer of each owned cell, shape (m,).
@@ -34,7 +35,15 @@ class CellStress:
         self.layer = space.layer.astype(np.int32)
         finite = model.scene.effects.finite_strain
         self.law = None if finite is None else LAWS[finite.law]
-        materials = model.system.materials
+        materials, self.own = model.system.materials, model.system.energy
+        if self.own is not None:
+            X = space.mesh.vertices[:, 0] + np.full(d, 1 / (d + 1)) @ space.mesh.edges
+            inputs = self.own.moduli(materials, self.layer, X)
+            self.moduli = inputs if finite is not None else self.own.at_rest(materials, self.layer, X)
+            if d == 2:
+                from softgrasp.fem.energy.plane import AcrossPlane  # only scenes with an energy of their own pay for it
+
+                self.across = AcrossPlane(model.scene, self.own.law, inputs)
         self.lam, self.mu = (np.array([getattr(m, key) for m in materials])[self.layer] for key in ("lam", "mu"))
 
     def __call__(self, u: Array) -> tuple[Array, Array, Array]:
@@ -53,7 +62,13 @@ class CellStress:
         for c in own:
             i, j = VOIGT[c]
             eps[c] = H[i, j] if i == j else (H[i, j] + H[j, i]) / 2
-        if self.law is None:
+        if self.own is not None:
+            self._own_stress(H, sigma)
+            if self.law is not None:
+                for c in own:
+                    i, j = VOIGT[c]
+                    eps[c] += (H[:, i] * H[:, j]).sum(axis=0) / 2
+        elif self.law is None:
             for c in own:
                 sigma[c] = 2 * mu * eps[c]
             sigma[:3] += lam * (eps[0] + eps[1] + eps[2])
@@ -72,3 +87,20 @@ class CellStress:
             squares += 2 * sigma[c] ** 2
         mises = np.sqrt(1.5 * squares)
         return eps.T, sigma.T, mises
+
+    def _own_stress(self, H: Array, sigma: Array) -> None:
+        """Write the stress of an own energy."""
+        d, h = self.d, H[: self.d, : self.d]
+        if self.law is None:
+            P, J = np.einsum("ijklm,klm->ijm", self.moduli, h), np.ones(h.shape[2])
+            F = np.broadcast_to(np.eye(d)[:, :, None], h.shape)
+        else:
+            assert self.own is not None
+            F, J = np.eye(d)[:, :, None] + h, 1 + volume_change(h)
+            P = self.own.law.stress(h, *self.moduli)
+        with np.errstate(invalid="ignore", divide="ignore"):  # J <= 0 at the midpoint of a cell has no stress
+            for c, (i, j) in enumerate(VOIGT):
+                if max(i, j) < d:
+                    sigma[c] = (P[i] * F[j]).sum(axis=0) / J
+            if d == 2:
+                sigma[2] = self.across.linear(h) if self.law is None else self.across.stress(h) / J

@@ -7,7 +7,7 @@ otherwise, ``shape`` is that of :func:`shape_of`, and ``name`` that of the mesh,
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from softgrasp.fem.errors import MeshError
 from softgrasp.fem.mesh.check import FLAT, Floats, Integers, longest_edges, place_text, quality
 from softgrasp.fem.shown import counted
 
+LITTLE = 0.05, 0.01  # straightening moves a node by less of its cell's longest edge, and changes the volume by less
 STRAIGHT = 1e-5  # of the longest edge: above the 6 digits of text files, far below the error of the elements
 
 # Corners of the faces of each shape (edges in 2D), counterclockwise seen from outside; corners come first in a cell.
@@ -60,25 +61,27 @@ def corners(cells: Integers, shape: str) -> Integers:
     return cells[:, : _CORNERS[shape]]
 
 
-def check_straight(points: Floats, cells: Integers, shape: str, kind: str, name: str) -> None:
-    """Refuse cells of higher order whose edge or face nodes leave the straight edges or flat faces.
+def check_straight(points: Floats, cells: Integers, shape: str, kind: str, name: str) -> tuple[str, ...]:
+    """Refuse cells of higher order that are curved, unless straightening them changes little.
 
-    A cell of straight edges is the simplex (or the hexahedron, ...) of its corners, wherever on its edges the
-    other nodes lie. Inner nodes do not shape a cell.
+    Curved are cells whose edge or face nodes leave the straight edges or flat faces. Triangles and tetrahedra of second
+    order are accepted within `LITTLE`, which leaves the corners where they are; the note that is returned says by how
+    much that changes the body. A cell of straight edges is the simplex (or the hexahedron, ...) of its corners,
+    wherever on its edges the other nodes lie. Inner nodes do not shape a cell.
 
     Args:
         cells: all nodes of the cells, shape (n_cells, nodes of a cell): corners, edges, faces, inside.
         kind: meshio's name of the cell type, for messages.
 
     Raises:
-        MeshError: the number of nodes fits no order, or a cell is curved by more than `STRAIGHT` of its longest edge.
+        MeshError: the number of nodes fits no order, or cells are curved by more than that.
     """
     size, count = cells.shape[1], _CORNERS[shape]
     if size == count or not len(cells):
-        return
+        return ()
     order = 2 if (shape, size) in _SERENDIPITY else next((p for p in range(1, 21) if _NODES[shape](p) == size), 0)
     if order < 2:
-        raise MeshError(f"{name} holds cells of type {kind} with {size} nodes: export the mesh with linear cells.")
+        raise MeshError(f"{name} has cells of type {kind} with {size} nodes: export the mesh with linear cells.")
     faces = _FACES[shape]
     loops = [list(zip(face, face[1:] + face[:1], strict=True)) for face in faces if len(face) > 2]
     edges = sorted({(min(e), max(e)) for loop in loops for e in loop}) or [f for f in faces if len(f) == 2]
@@ -100,11 +103,49 @@ def check_straight(points: Floats, cells: Integers, shape: str, kind: str, name:
         relative = np.where(curved, off / np.where(longest > 0, longest, 1.0), 0.0)
         worst = int(np.argmax(relative))
         place = place_text(points[where[worst]])
-        raise MeshError(
+        text = (
             f"{name} has {counted(int(curved.sum()), 'curved cell')} of type {kind}, the worst node lies "
             f"{off[worst]:.3g} m off its straight edge or flat face ({relative[worst]:.3g} of the longest edge) "
-            f"at {place}: export the mesh with straight edges or linear cells."
+            f"at {place}"
         )
+        simple = order == 2 and size == len(edges) + count and count == DIMENSIONS[shape] + 1
+        change = volume_of_curves(points, cells, edges) if simple else np.inf
+        share = -change / (1 + change) if simple else 0.0
+        if relative[worst] > LITTLE[0] or abs(change) > LITTLE[1]:
+            told = f", and straight cells would change its volume by {100 * share:.2f} %" if simple else ""
+            raise MeshError(f"{text}{told}: export the mesh with smaller cells, straight edges or linear cells.")
+        return (f"{text}; they are straightened, which changes the volume of the body by {100 * share:.2f} %.",)
+    return ()
+
+
+def volume_of_curves(points: Floats, cells: Integers, edges: Sequence[tuple[int, ...]]) -> float:
+    """Volume between curved and straight second-order simplices, over that of the straight ones [1].
+
+    To first order in the offsets d of the middle nodes: of a parabola over an edge 2/3 d.n |edge|, of a face with three
+    of them (d_1 + d_2 + d_3).n |face| / 3; inside the body both sides cancel.
+    """
+    corner = points[cells[:, : cells.shape[1] - len(edges)]]
+    offsets = {}
+    for a, b in edges:  # the middle nodes may come in another order: take the nearest
+        middle = (corner[:, a] + corner[:, b]) / 2
+        nodes = points[cells[:, -len(edges) :]]
+        nearest = np.linalg.norm(nodes - middle[:, None], axis=2).argmin(axis=1)
+        offsets[min(a, b), max(a, b)] = nodes[np.arange(len(cells)), nearest] - middle
+    d = corner.shape[1] - 1
+    sides = corner[:, 1:] - corner[:, :1]
+    whole = np.linalg.det(sides[..., :d]) / (2.0 if d == 2 else 6.0)
+    total = np.zeros(len(cells))
+    for face in _FACES["triangle" if d == 2 else "tetra"]:
+        ends = corner[:, face]
+        if d == 2:
+            along = ends[:, 1] - ends[:, 0]
+            offset = offsets[min(face), max(face)]
+            total += 2 / 3 * (along[:, 1] * offset[:, 0] - along[:, 0] * offset[:, 1])
+        else:
+            normal = np.cross(ends[:, 1] - ends[:, 0], ends[:, 2] - ends[:, 0]) / 2
+            for a, b in ((face[0], face[1]), (face[1], face[2]), (face[0], face[2])):
+                total += (normal * offsets[min(a, b), max(a, b)]).sum(axis=1) / 3
+    return float((np.sign(whole) * total).sum() / np.abs(whole).sum())
 
 
 def simplices(cells: Integers, shape: str, turn: int = 0) -> tuple[Integers, Integers]:

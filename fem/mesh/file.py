@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +31,14 @@ from softgrasp.fem.mesh.check import (
     check_cells,
     doubled_nodes,
     doubled_text,
-    find_parts,
-    hanging_nodes,
-    hanging_text,
     sort_facets,
 )
 from softgrasp.fem.mesh.foreign import read_foreign
-from softgrasp.fem.mesh.tissue_mesh import Marks, MeshArrays, Sets, TissueMesh, spread
+from softgrasp.fem.mesh.tissue_mesh import MeshArrays, Sets, TissueMesh, inspected, spread
 
 
 def _text(sets: Sets) -> str:
-    """The same for equal sets, in whatever order they were read."""
+    """Text of named sets, whatever the order in which they were read."""
     return repr(sorted((repr(name), tuple(int(mark) for mark in marks)) for name, marks in sets.items()))
 
 
@@ -59,8 +57,8 @@ def read_mesh(
     """Read a mesh and cut its cells into linear triangles or tetrahedra, with its facet and cell tags.
 
     Quadrilaterals, hexahedra, wedges and pyramids are cut as in `fem.mesh.cells.simplices`, cells of higher order with
-    straight edges are reduced to their corners. Cells of the highest dimension make the body, those one
-    dimension lower carry the facet tags.
+    straight edges are reduced to their corners, and slightly curved ones of second order too, with a note. Cells of
+    the highest dimension make the body, those one dimension lower carry the facet tags.
 
     Collective. Rank 0 reads and checks.
 
@@ -71,7 +69,8 @@ def read_mesh(
         limit: longest processor time for a file that meshio may never end [s]; by its size if None.
 
     Raises MeshError: the file is missing or unreadable, needs longer than the limit, has polygons, polyhedra or
-    curved cells, a mesh of surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted.
+    strongly curved cells, a mesh of surfaces only is not in the plane z = 0, or a cell is flat, inverted or too
+    distorted.
     """
     arrays: MeshArrays | None = None
     with raise_on_all_ranks(comm):
@@ -89,7 +88,7 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limi
     dimension = max((DIMENSIONS[shape] for shape in filled), default=0)
     if None in shapes or dimension < 2:
         raise MeshError(
-            f"{path} holds cells of type {', '.join(kinds) or 'none'}: only triangles, quadrilaterals, tetrahedra, "
+            f"{path} has cells of type {', '.join(kinds) or 'none'}: only triangles, quadrilaterals, tetrahedra, "
             "hexahedra, wedges and pyramids are accepted, export the mesh with these."
         )
     for block in raw.cells:
@@ -101,8 +100,7 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limi
     used = np.unique(np.concatenate([corners(nodes, shape).ravel() for _, shape, nodes in bodies]))
     if dimension == 2:
         points = _in_plane(points, used, path)
-    for i, shape, nodes in bodies:
-        check_straight(points, nodes, shape, raw.cells[i].type, str(path))
+    curved = [check_straight(points, nodes, shape, raw.cells[i].type, str(path)) for i, shape, nodes in bodies]
     cut = [cut_cells(points, corners(nodes, shape), shape, str(path)) for _, shape, nodes in bodies]
     check_interfaces(points, [(corners(nodes, shape), shape) for _, shape, nodes in bodies], str(path))
     cells, cell_tags, cell_sets = _marked(raw, bodies, cut, tag_name, dimension)
@@ -117,26 +115,19 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limi
     facet_tags = None if facet_tags is None else facet_tags[kept]
     sides = sort_facets(cells)
     first = doubled_nodes(points, cells, sides, seam)
-    notes = doubled_text(points, first, seam, repair, str(path))
+    notes = [*itertools.chain(*curved), *doubled_text(points, first, seam, repair, str(path))]
     if repair and notes:
         used, number = np.unique(first, return_inverse=True)
         points, cells = points[used], check_cells(points[used], number[cells], False, str(path))
         _, sole = np.unique(np.sort(number[facets], axis=1), axis=0, return_index=True)  # one of both sides of a seam
         facets, facet_tags = number[facets][sole], None if facet_tags is None else facet_tags[sole]
         sides = sort_facets(cells)
-    notes += hanging_text(points, hanging_nodes(points, cells, sides, seam), str(path))
-    part_tags, parts = find_parts(points, cells, sides, str(path)) or (None, None)
-    marks: Marks = {
-        "facet_tags": (dimension - 1, facets, facet_tags),
-        "cell_tags": (dimension, cells, cell_tags),
-        "part_tags": (dimension, cells, part_tags),
-    }
     # some formats spread coordinates, cells, tags and sets over several files
     sets = [np.frombuffer(_text(each).encode(), dtype=np.uint8) for each in (cell_sets, facet_sets)]
     text = digest(points, cells, cell_tags, facets, facet_tags, *sets)
-    known: dict[str, Any] = {"source": path.name, "parts": parts, "notes": tuple(notes), "digest": text}
+    known: dict[str, Any] = {"source": path.name, "notes": tuple(notes), "digest": text}
     known |= {"facet_sets": facet_sets, "cell_sets": cell_sets}
-    return MeshArrays(points, cells, marks, known)
+    return inspected((points, cells, cell_tags), (facets, facet_tags), sides, known, seam, str(path))
 
 
 def _read(path: Path, limit: float | None) -> meshio.Mesh:
@@ -270,7 +261,7 @@ def _in_plane(points: Floats, used: Integers, path: Path) -> Floats:
         height = np.abs(points[used, 2]).max()
         if not height <= 1e-10 * np.ptp(points[used, :2], axis=0).max():  # also false for NaN
             raise MeshError(
-                f"{path} holds surface cells only, and they leave the plane z = 0 (|z| up to {height:.3g}): "
+                f"{path} has surface cells only, and they leave the plane z = 0 (|z| up to {height:.3g}): "
                 "give a flat mesh in x and y, or one of solid cells."
             )
     return np.ascontiguousarray(points[:, :2])

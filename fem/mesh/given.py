@@ -12,20 +12,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.checksums import digest
 from softgrasp.fem.errors import MeshError, raise_on_all_ranks
-from softgrasp.fem.mesh.check import (
-    SEAM,
-    Floats,
-    Integers,
-    Ints,
-    check_cells,
-    doubled_nodes,
-    doubled_text,
-    find_parts,
-    hanging_nodes,
-    hanging_text,
-    sort_facets,
-)
-from softgrasp.fem.mesh.tissue_mesh import Marks, MeshArrays, Sets, TissueMesh, cell_nodes, spread
+from softgrasp.fem.mesh.check import SEAM, Floats, Integers, Ints, check_cells, doubled_nodes, doubled_text, sort_facets
+from softgrasp.fem.mesh.tissue_mesh import MeshArrays, Sets, TissueMesh, cell_nodes, inspected, spread
 from softgrasp.fem.petsc import rows_on_root
 
 if TYPE_CHECKING:
@@ -185,7 +173,6 @@ def _arrays(
 
     Raises MeshError: a point is not finite, or a cell is flat.
     """
-    d, name = points.shape[1], NAME
     order = np.lexsort(points.T[::-1])
     number = np.argsort(order)
     points = points[order]
@@ -193,24 +180,18 @@ def _arrays(
     by = [np.lexsort(each.T[::-1]) for each in rows]
     sorted_ = [each[place] for each, place in zip(rows, by, strict=True)]
     marks = [None if values is None else values[place] for (_, values), place in zip(entities, by, strict=True)]
-    cells, facets = check_cells(points, sorted_[0], True, name), sorted_[1]  # DOLFINx uses cells of any orientation
+    cells, facets = check_cells(points, sorted_[0], True, NAME), sorted_[1]  # DOLFINx uses cells of any orientation
     sides = sort_facets(cells)
-    notes = doubled_text(points, doubled_nodes(points, cells, sides, SEAM), SEAM, False, name, "join them")
-    notes += hanging_text(points, hanging_nodes(points, cells, sides, SEAM), name)
-    part_tags, parts = find_parts(points, cells, sides, name) or (None, None)
+    notes = doubled_text(points, doubled_nodes(points, cells, sides, SEAM), SEAM, False, NAME, "join them")
     text = digest(points, sorted_[0], marks[0], facets, marks[1])
-    known: dict[str, Any] = {"source": GIVEN, "parts": parts, "notes": tuple(notes), "digest": text}
+    known: dict[str, Any] = {"source": GIVEN, "notes": tuple(notes), "digest": text}
     known |= {"cell_sets": sets[0], "facet_sets": sets[1]}
-    on: Marks = {
-        "facet_tags": (d - 1, facets, marks[1]),
-        "cell_tags": (d, cells, marks[0]),
-        "part_tags": (d, cells, part_tags),
-    }
+    arrays = inspected((points, cells, marks[0]), (facets, marks[1]), sides, known, SEAM, NAME)
     labels = None
-    if part_tags is not None:
+    if (part_tags := arrays.marks["part_tags"][2]) is not None:
         labels = np.empty(len(cells), dtype=np.int32)
         labels[by[0]] = part_tags
-    return MeshArrays(points, cells, on, known), labels
+    return arrays, labels
 
 
 def _part_tags(mesh: dolfinx.mesh.Mesh, labels: Ints) -> dolfinx.mesh.MeshTags:

@@ -44,6 +44,14 @@ def _resolved(scene: Scene, without: Iterable[str]) -> dict[str, Any]:
     if tissue.get("mesh") is not None:
         given = scene._given
         tissue["mesh"] = scene._mesh_digest or (_mesh_digest(scene) if given is None else given.tissue.digest)
+    if tissue.get("energy") is not None:
+        tissue["energy"] = _energy_digest(scene)
+    else:  # scenes of the built-in laws keep the hashes that they had before there were others
+        for table in (tissue, *tissue.get("layers", {}).values()):
+            table.pop("energy", None)
+            table.pop("parameters", None)
+    if scene._terms:
+        data["terms"] = {term.name: {"value": term.value, "form": term.digest} for term in scene._terms}
     if motion.get("csv") is not None:
         motion["csv"] = _digest(scene, motion["csv"], "motion.csv")
     replace_paths(data, lambda name: _digest(scene, name, "csv of an obstacle's path"))
@@ -56,6 +64,22 @@ def _mesh_digest(scene: Scene) -> str:
     tissue = scene.tissue
     path = scene.path(str(tissue.mesh))
     return str(load_arrays(path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit).known["digest"])
+
+
+def _energy_digest(scene: Scene) -> str:
+    from softgrasp.fem.energy.own import energy_of  # only scenes with an energy of their own pay for it
+
+    energy, d = energy_of(scene), scene.dimension
+    if d is None and scene._given is not None:
+        d = scene._given.tissue.dimension
+    elif d is None:
+        from softgrasp.fem.mesh.file import load_arrays
+
+        tissue = scene.tissue
+        path = scene.path(str(tissue.mesh))
+        d = load_arrays(path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit).points.shape[1]
+    assert energy is not None
+    return str(energy.law(scene, d).signature)
 
 
 def _digest(scene: Scene, name: str, key: str) -> str:

@@ -15,7 +15,7 @@ from dolfinx.graph import adjacencylist
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.mesh.check import Floats, Integers, Ints, Parts
+from softgrasp.fem.mesh.check import Facets, Floats, Integers, Ints, Parts, find_parts, hanging_nodes, hanging_text
 
 Sets = dict[int | str, tuple[int, ...]]  # marks of each tag number and named set of a file
 Marks = dict[str, tuple[int, Integers, Ints | None]]  # dimension of entities, their nodes, one value each or None
@@ -29,6 +29,38 @@ class MeshArrays:
     cells: Integers  # shape (n_cells, d + 1)
     marks: Marks  # mesh tags by field of TissueMesh
     known: dict[str, Any]  # other fields of TissueMesh
+
+
+def inspected(
+    body: tuple[Floats, Integers, Ints | None],
+    facets: tuple[Integers, Ints | None],
+    sides: Facets,
+    known: dict[str, Any],
+    seam: float,
+    name: str,
+) -> MeshArrays:
+    """The arrays of a mesh with the parts of its body and a note on its hanging nodes.
+
+    Args:
+        body: points (n_points, d) [m], cells (n_cells, d + 1) and their marks.
+        facets: marked facets (n, d) and their marks.
+        sides: the facets of all cells, from `sort_facets`.
+        known: other fields of TissueMesh; its notes are those on doubled nodes.
+        seam: share of the shortest edge, as of `read_mesh` [1].
+        name: the mesh in messages.
+
+    Raises MeshError: a facet has more than two cells.
+    """
+    points, cells, cell_tags = body
+    d = points.shape[1]
+    part_tags, parts = find_parts(points, cells, sides, name) or (None, None)
+    notes = (*known["notes"], *hanging_text(points, hanging_nodes(points, cells, sides, seam), name))
+    marks: Marks = {
+        "facet_tags": (d - 1, *facets),
+        "cell_tags": (d, cells, cell_tags),
+        "part_tags": (d, cells, part_tags),
+    }
+    return MeshArrays(points, cells, marks, known | {"notes": notes, "parts": parts})
 
 
 @dataclass(frozen=True)

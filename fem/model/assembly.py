@@ -24,6 +24,7 @@ from softgrasp.fem.scene.scene import FiniteStrain, Scene
 from softgrasp.fem.system import Component, LayerBlocks
 
 if TYPE_CHECKING:
+    from softgrasp.fem.energy.layers import LayerEnergy
     from softgrasp.fem.strain.points import QuadraturePoints
 
 
@@ -154,30 +155,54 @@ def _component(space: Discretisation, A: PETSc.Mat, thickness: float) -> Compone
     return Component(ee, es, total(space.layout.comm, ss))
 
 
-def assemble(space: Discretisation, scene: Scene, inventory: Inventory) -> tuple[LayerBlocks, ...]:
+class Blocks:
+    """Forms of one scene as blocks of hand and tissue, layer by layer, in one pattern. Making one is collective."""
+
+    def __init__(self, space: Discretisation, scene: Scene) -> None:
+        self.space, self.thickness, self.domain = space, scene.tissue.thickness, space.mesh.mesh
+        self.layered = bool(scene.tissue.layers)
+        self.cells = [np.flatnonzero(space.layer == i).astype(np.int32) for i in range(len(space.layers))]
+        self.csr: Any = None
+        if len(self.cells) > 1:
+            # DOLFINx gives a layer the pattern of its own cells, and sums of layers need one pattern for all
+            owned = np.arange(space.mesh.owned, dtype=np.int32)
+            whole = ufl.Measure("dx", domain=self.domain, subdomain_data=[(1, owned)])(1)
+            self.csr = dolfinx.fem.create_matrix(dolfinx.fem.form(_bilinear(space.V)["M_1"](whole)))
+
+    def __call__(self, form: Callable[[Any], Any], layer: int) -> Component:
+        """The blocks of a bilinear form, a function of the measure, on the cells of a layer. Collective."""
+        dx = ufl.dx(self.domain)
+        if self.layered:
+            dx = ufl.Measure("dx", domain=self.domain, subdomain_data=[(1, self.cells[layer])])(1)
+        return self.whole(form(dx))
+
+    def whole(self, form: Any) -> Component:
+        """The blocks of a bilinear form. Collective."""
+        compiled = dolfinx.fem.form(form)
+        self.csr = self.csr or dolfinx.fem.create_matrix(compiled)
+        return _component(self.space, _assembled(self.domain.comm, self.csr, compiled), self.thickness)
+
+
+def assemble(
+    space: Discretisation, blocks: Blocks, inventory: Inventory, elastic: bool = True
+) -> tuple[LayerBlocks, ...]:
     """Assemble K_mu, K_lambda and M_1, once per layer; a uniform body is one layer. Collective.
 
-    One form is compiled for each component: layers share it and differ in their cells only.
+    One form is compiled for each component: layers share it and differ in their cells only. Without ``elastic`` M_1
+    stands in all three places: an own energy brings its stiffness.
     """
-    domain = space.mesh.mesh
-    layers = {name: np.flatnonzero(space.layer == i).astype(np.int32) for i, name in enumerate(space.layers)}
     forms = _bilinear(space.V)
+    if not elastic:
+        forms = {"M_1": forms["M_1"]}
     inventory.forms += list(forms)
-    csr = None  # one pattern for all
-    if len(layers) > 1:
-        # DOLFINx gives a layer the pattern of its own cells, and sums of layers need one pattern for all
-        owned = np.arange(space.mesh.owned, dtype=np.int32)
-        whole = ufl.Measure("dx", domain=domain, subdomain_data=[(1, owned)])(1)
-        csr = dolfinx.fem.create_matrix(dolfinx.fem.form(forms["M_1"](whole)))
     result = []
-    for name, cells in layers.items():
-        dx = ufl.Measure("dx", domain=domain, subdomain_data=[(1, cells)])(1) if scene.tissue.layers else ufl.dx(domain)
+    for i, name in enumerate(space.layers):
         parts = {}
         for key, form in forms.items():
-            compiled = dolfinx.fem.form(form(dx))
-            csr = csr or dolfinx.fem.create_matrix(compiled)
-            parts[key] = _component(space, _assembled(domain.comm, csr, compiled), scene.tissue.thickness)
+            parts[key] = blocks(form, i)
             inventory.operators.append(f"{key}[{name}]")
+        for key in ("K_mu", "K_lambda"):
+            parts.setdefault(key, parts["M_1"])
         result.append(LayerBlocks(name, **parts))
     return tuple(result)
 
@@ -223,23 +248,32 @@ def layer_numbers(mesh: TissueMesh, scene: Scene) -> tuple[tuple[str, ...], np.n
     return names if counts[-1] else names[:-1], numbers
 
 
-def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> QuadraturePoints:
+def make_points(
+    space: Discretisation, scene: Scene, effect: FiniteStrain, energy: LayerEnergy | None = None
+) -> QuadraturePoints:
     """Points of the owned cells; K(0) = K_ee to rounding. Collective."""
     from softgrasp.fem.strain.points import QuadraturePoints, make_gradient  # only scenes with finite strain pay for it
 
-    d, V, order = space.mesh.dimension, space.V, scene.tissue.order
+    d, V = space.mesh.dimension, space.V
     edges, cells = space.mesh.edges, space.mesh.owned
-    # exact for K(0), all weights positive
-    at, weights = basix.make_quadrature(V.element.basix_element.cell_type, 1 if order == 1 else 2 * order)
+    at, weights, _ = quadrature(space)
     volume = np.abs(np.linalg.det(edges)) * scene.tissue.thickness
     vol = (volume[:, None] * weights).ravel()
     first = space.mesh.mesh.topology.index_map(d).local_range[0]
     layout, each = space.layout, len(weights)
     nodes = _free_nodes(space)[V.dofmap.list[:cells]]
+    law = effect.law if energy is None else energy.law
     B = make_gradient(layout.comm, space.gradients(at), nodes, (layout.n_local, layout.n_e))
     cell = np.repeat(np.arange(first, first + cells), each)
     places = (space.mesh.vertices[:, :1] + at @ edges).reshape(-1, d)
-    return QuadraturePoints(B, vol, np.repeat(space.layer, each), cell, places, d, effect.law, effect.tol)
+    return QuadraturePoints(B, vol, np.repeat(space.layer, each), cell, places, d, law, effect.tol, energy)
+
+
+def quadrature(space: Discretisation) -> tuple[Array, Array, int]:
+    """Points, positive weights and degree of a rule on the reference cell that is exact for K(0)."""
+    element = space.V.element.basix_element
+    degree = 1 if element.degree == 1 else 2 * element.degree
+    return *basix.make_quadrature(element.cell_type, degree), degree
 
 
 def _free_nodes(space: Discretisation) -> np.ndarray:

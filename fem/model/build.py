@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -18,11 +19,11 @@ from softgrasp.fem.effects.damping import operator as damping_operator
 from softgrasp.fem.effects.gravity import acceleration
 from softgrasp.fem.effects.rotation import hand_mass
 from softgrasp.fem.errors import SceneError, raise_on_all_ranks, shortened
-from softgrasp.fem.material import LayerMaterial, in_words
+from softgrasp.fem.material import REST, LayerMaterial, in_words, of_layers
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.mesh.scene_hash import scene_hash, scene_keys
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
-from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise, make_points
+from softgrasp.fem.model.assembly import Blocks, Discretisation, Inventory, assemble, discretise, make_points
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.memory import box_simplices, check_memory
 from softgrasp.fem.model.outputs import Output, make_outputs, output_columns
@@ -33,6 +34,9 @@ from softgrasp.fem.scene.scene import Scene, check_dimension
 from softgrasp.fem.scene.table import read_motion
 from softgrasp.fem.shown import Card, Shown, listed
 from softgrasp.fem.system import BlockSystem, LayerBlocks, coupling, tissue_matrices
+
+if TYPE_CHECKING:
+    from softgrasp.fem.energy.layers import LayerEnergy
 
 
 @dataclass(frozen=True)
@@ -112,6 +116,7 @@ class Model(Shown):
             ("mesh", f"{layout.dimension}D, P{layout.order}, {self.cells} cells"),
             ("unknowns", f"hand {layout.n_s}, tissue {layout.n_e}, {self.states} states"),
             ("material", in_words(self.system.materials)),
+            *([] if self.system.energy is None else [("energy", self.system.energy.in_words())]),
             ("effects", listed(on)),
             ("motion", f"{scene.motion.profile}, {scene.time.steps} steps to {scene.time_end:g} s"),
             ("error of the mesh", estimate),
@@ -151,9 +156,34 @@ class Model(Shown):
     def displacement(self, z: Array, q_s: Array) -> Any:
         """Absolute displacement u = R q_s + (z + T q_s) as a function [m], ghosts updated. Collective.
 
-        With velocities in place of z, local rows (n_local,) [m], and q_s (n_s,) [m, rad] it is the absolute velocity.
+        For z, local rows (n_local,) [m], and q_s (n_s,) [m, rad]; with ``effects.frame`` z is in the axes of the hand.
         """
+        if self.system.frame is not None:
+            return import_module("softgrasp.fem.model.turned").turned_displacement(self.space, self.system, z, q_s)
         return self.space.nodal(z + self.system.T @ q_s, self.space.R @ q_s)
+
+    def to_pymor(self) -> Any:
+        """The full model as ``pymor.models.iosys.SecondOrderModel``, affine in the material of each layer.
+
+        Parameters are ``mu``, ``lambda`` [Pa], ``rho`` [kg/m^3] and, with damping, ``beta`` [s], one number a layer;
+        see :func:`softgrasp.fem.model.pymor.second_order`.
+
+        Raises SoftgraspError: pyMOR is not installed, the program runs on several ranks, or the tissue strains
+            finitely.
+        """
+        return import_module("softgrasp.fem.model.pymor").second_order(self)  # optional, and it knows this class
+
+    def velocity(self, z: Array, v: Array, q_s: Array, v_s: Array) -> Any:
+        """Absolute velocity of the nodes as a function [m/s], ghosts updated. Collective.
+
+        Args:
+            z: displacement against the hand, local rows (n_local,) [m]; it counts with ``effects.frame`` only.
+            v: its rate, local rows (n_local,) [m/s].
+            q_s, v_s: displacement and velocity of the hand, (n_s,) each [m, rad; m/s, rad/s].
+        """
+        if self.system.frame is not None:
+            return import_module("softgrasp.fem.model.turned").turned_velocity(self.space, self.system, z, v, q_s, v_s)
+        return self.displacement(v, v_s)
 
     def with_materials(
         self,
@@ -186,16 +216,45 @@ class Model(Shown):
             if not (np.isfinite(young) and young > 0 and -1 < poisson < 0.5):
                 raise SceneError(f"young = {young}, poisson = {poisson}: young must be > 0, poisson between -1 and 0.5")
             lam, mu = lame(young, poisson)
-        changes = {key: value for key, value in (("lam", lam), ("mu", mu), ("rho", rho)) if value is not None}
+        changes: dict[str, Any] = {
+            key: value for key, value in (("lam", lam), ("mu", mu), ("rho", rho)) if value is not None
+        }
         d = self.system.layout.dimension
-        materials = tuple(replace(m, **changes) for m in self.system.materials)
-        for m in materials:
+        rows = [
+            replace(m, **{key: x for key, x in changes.items() if key == "rho" or not m.part})
+            for m in self.system.materials
+        ]
+        materials = tuple(rows)
+        for m in of_layers(materials):
             if not (np.isfinite([m.lam, m.mu, m.rho]).all() and m.mu > 0 and m.rho > 0 and m.lam + 2 * m.mu / d > 0):
                 raise SceneError(
                     f"lambda = {m.lam}, mu = {m.mu}, rho = {m.rho} is no material; mu, rho and lambda + 2 mu / {d} "
                     "must be positive"
                 )
         return replace(self, system=self.system.with_materials(materials), accuracy=None)
+
+    def with_parameters(self, **values: float) -> Model:
+        """The same mesh with other parameters of an own energy or of own terms, in every layer. Collective.
+
+        Only sums of matrices that are there; nothing is assembled. The error of the mesh is another and is left out.
+
+        Args:
+            values: by the names of ``tissue.parameters``.
+
+        Raises SceneError: there is no such parameter, its value is not finite, or the stiffness is not affine in it.
+        """
+        rows = list(self.system.materials)
+        known = sorted({m.part for m in rows if m.part and m.part != REST})
+        for key, value in values.items():
+            if not isinstance(value, Real) or not np.isfinite(value):
+                raise SceneError(f"{key} = {shortened(repr(value))} must be a finite number")
+            if key not in known:
+                own = self.system.energy
+                text = "" if own is None else own.why_not(key)
+                has = ", ".join(known) or "none"
+                raise SceneError(text or f"the model has no parameter '{key}' that it is affine in; it has {has}")
+            rows = [replace(m, mu=float(value)) if m.part == key else m for m in rows]
+        return replace(self, system=self.system.with_materials(tuple(rows)), accuracy=None)
 
 
 def checked_model(model: object) -> Model:
@@ -220,6 +279,40 @@ def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[Laye
         own = None if layer is None or damping is None else layer.beta
         result.append(LayerMaterial(m.lam, m.mu, m.rho, beta if own is None else own))
     return tuple(result)
+
+
+def _assembled(
+    comm: MPI.Intracomm, space: Discretisation, scene: Scene, blocks: Blocks, inventory: Inventory
+) -> tuple[tuple[LayerBlocks, ...], tuple[LayerMaterial, ...], LayerEnergy | None]:
+    """Blocks and materials of the layers, with an own energy also of its parameters, and that energy. Collective."""
+    if scene.tissue.energy is None:
+        layers = assemble(space, blocks, inventory)
+        return layers, layer_materials(scene, layers), None
+    from softgrasp.fem.energy.own import energy_of  # only scenes with an energy of their own pay for it
+    from softgrasp.fem.model.energy import energy_blocks
+
+    with raise_on_all_ranks(comm):
+        own = energy_of(scene)
+    assert own is not None
+    layers = assemble(space, blocks, inventory, elastic=False)
+    result = energy_blocks(space, scene, own, blocks, layers, layer_materials(scene, layers))
+    inventory.operators += [f"K[{each.name}]" for each in result[0]]
+    return result
+
+
+def _with_terms(
+    space: Discretisation,
+    scene: Scene,
+    blocks: Blocks,
+    T: Array,
+    layers: tuple[LayerBlocks, ...],
+    materials: tuple[LayerMaterial, ...],
+) -> tuple[tuple[LayerBlocks, ...], tuple[LayerMaterial, ...]]:
+    """The same with the rows of own terms. Collective."""
+    from softgrasp.fem.model.terms import term_blocks  # only scenes with terms of their own pay for it
+
+    rows, values = term_blocks(space, scene, blocks, T, of_layers(materials))
+    return (*layers, *rows), (*materials, *values)
 
 
 def build(
@@ -266,21 +359,23 @@ def build(
         check_memory(scene, comm, run, d, mesh.mesh.topology.index_map(d).size_global)
     with watch.stage("assembly"):
         space = discretise(mesh, scene)
-        layers = assemble(space, scene, inventory)
-        materials = layer_materials(scene, layers)
-        M_ee, K_ee = tissue_matrices(layers, materials)
-        inventory.operators += ["M_ee", "K_ee"]
+        blocks = Blocks(space, scene)
+        layers, materials, energy = _assembled(comm, space, scene, blocks, inventory)
         layout = space.layout
         T = np.asfortranarray(rigid_modes(layout.nodes, layout.dimension, scene.effects.rotation, layout.reference))
+        if scene._terms:
+            layers, materials = _with_terms(space, scene, blocks, T, layers, materials)
+        M_ee, K_ee = tissue_matrices(layers, materials)
         G, M_rigid = coupling(layers, materials, T)
-        inventory.operators += ["T", "G"]
+        inventory.operators += ["M_ee", "K_ee", "T", "G"]
         damping = damping_operator(scene, layers, materials)
         if damping.matrix is not None:
             inventory.operators.append("D_ee")
         points, law = None, scene.effects.finite_strain
         if law is not None:
-            points = make_points(space, scene, law)
+            points = make_points(space, scene, law, energy)
             inventory.operators.append("B")
+        moments = import_module("softgrasp.fem.model.moments") if scene.effects.frame else None  # few scenes pay for it
         system = BlockSystem(
             layout=layout,
             layers=layers,
@@ -297,5 +392,7 @@ def build(
             two_way=scene.effects.reaction,
             graded=scene.tissue.refine is not None and scene.tissue.refine.grading != "off",
             points=points,
+            energy=energy,
+            frame=None if moments is None else moments.frame_integrals(space, scene, inventory),
         )
     return Model(scene, space, system, inventory, watch)

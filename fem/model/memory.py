@@ -72,6 +72,8 @@ def need(scene: Scene, dimension: int, cells: int, ranks: int, free: float, run:
     # times; q, v, a, c, pulls and temporaries of the hand's table; outputs, their sum and their rigid share: measured
     # 194 byte a step for n_s = d = 2
     row = 8.0 * (2 + 7 * n_s + 4 * outputs)
+    if scene.effects.frame is not None:  # shares of the momenta, twice while they are summed
+        row += 8.0 * 2 * (d + d * d + n_s)
     strain = copies * STRAIN_BYTES.get(kind, 0.0) if scene.effects.finite_strain is not None else 0.0
     return Need(
         mesh=cells * (CELL_BYTES[kind] + len(scene.tissue.layers) * LAYER_BYTES[kind] + strain),

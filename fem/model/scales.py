@@ -8,6 +8,7 @@ from softgrasp.fem.effects.damping import ratios
 from softgrasp.fem.effects.gate import SMALL_SHARE, Gradient, Problem, Sag
 from softgrasp.fem.effects.gravity import EARTH, acceleration
 from softgrasp.fem.layout import bounding_box
+from softgrasp.fem.material import of_layers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, normalising, times_columns, total
 from softgrasp.fem.solve.solvers import choose_solver
@@ -109,7 +110,7 @@ def measure(model: Model, omega: Array, Phi: Array, a: Array) -> Problem:
         scene=model.scene,
         dimension=mesh.dimension,
         length=float(np.max(high - low)),
-        materials=system.materials,
+        materials=of_layers(system.materials),
         tissue_mass=mass,
         tissue_inertia=inertia,
         omega=tuple(omega.tolist()),

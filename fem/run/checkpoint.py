@@ -26,7 +26,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.shown import counted
 
-FORMAT = 6
+FORMAT = 7
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # keys of [output] that change no number of a run
 FREE = ("name", "description", "reduction", "study")
 OLD = ("*step*-rank*", "*frame*.npz")  # patterns of the files that a new manifest makes useless
@@ -51,6 +51,7 @@ class RestartState:
     pulls: Array  # products G'w of each step so far, (n + 1, n_s or 2 n_s); c'G'w is half the work of the load
     energies: Array  # dissipated, initial and largest energy, (3,) [J]
     residual_first: float  # relative residual of the first solve [1]
+    taken: Array | None = None  # energy dissipated here, and work of contact, so far, (n + 1, 2) [J]; None without both
     forces: Array | None = None  # force on the hand so far, (n, n_s) [N, N m]; None where the motion is prescribed
     solver_rows: Array | None = None  # vectors kept by the iterations of finite strain or of a solver, or None
     solver_numbers: Array | None = None  # numbers kept by these iterations, or None

@@ -48,20 +48,11 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     def _prepare(self) -> None:
         """Points, vectors and iteration. Collective."""
-        system, points = self.system, self.system.points
-        assert points is not None
-        self.comm: MPI.Intracomm = system.layout.comm
+        self.comm: MPI.Intracomm = self.system.layout.comm
         self.dot: Callable[[Array, Array], float] = np.dot
         if self.comm.size > 1 and not self.operators.whole:
             self.dot = lambda a, b: self.over_ranks(float(np.dot(a, b)))
-        if self.operators.whole:
-            points = whole_points(points, self.comm, self.operators.enter(np.arange(system.layout.n_e)))
-        self.body, self.tol = (
-            HyperelasticBody(points, system.materials, None if self.operators.whole else system.K_ee),
-            points.tol,
-        )
-        if not self.comm.allreduce(self.body.kernel is not None, MPI.LAND):
-            self.body.kernel = None  # ranks that store all rows compute the same bits
+        self.body, self.tol = self._make_body()
         self.inertia, self.drag = (*self.operators.parts, None)[:2]
         for part in self.operators.parts:
             part.convert("aij")
@@ -69,7 +60,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         vectors = (self.trial, self.f, self.y, self.solved)
         self.trial_array, self.f_array, self.y_array, self.solved_array = (x.array_w for x in vectors)
         pairs = Pairs(self._dots, len(self.w_array))
-        self.newton = QuasiNewton(self._residual, self._apply, lambda w: self._renew(self.at.array_r + w), pairs)
+        self.newton = self._make_iteration(pairs)
         self.past: deque[Array] = deque(maxlen=KEPT)
         self.tangent_at: Array | None = None
         self.counts, self.refactor_cost = Counts(), self._refactor_cost()
@@ -77,6 +68,20 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.load = self.right = np.zeros_like(self.r_array)
         self.last = 0.0
         self._propagate = self._carry_on
+
+    def _make_body(self) -> tuple[HyperelasticBody, float]:
+        """The law on the rows here, and the tolerance of a step. Collective."""
+        system, points = self.system, self.system.points
+        assert points is not None
+        if self.operators.whole:
+            points = whole_points(points, self.comm, self.operators.enter(np.arange(system.layout.n_e)))
+        body = HyperelasticBody(points, system.materials, None if self.operators.whole else system.K_ee)
+        if not self.comm.allreduce(body.kernel is not None, MPI.LAND):
+            body.kernel = None  # ranks that store all rows compute the same bits
+        return body, points.tol
+
+    def _make_iteration(self, pairs: Pairs) -> QuasiNewton:
+        return QuasiNewton(self._residual, self._apply, lambda w: self._renew(self.at.array_r + w), pairs)
 
     substeps: int  # number of substeps of the step in work, 1 without substepping [1]
     jump: Array | None  # change of the velocity over a substepped step, rows here [m/s]; None without substeps

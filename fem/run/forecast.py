@@ -86,7 +86,7 @@ def forecasts(model: Model) -> tuple[Forecast, ...]:
     Ranks beyond the cores of this node are on further nodes like it.
     """
     scene, layout, mesh = model.scene, model.system.layout, model.space.mesh
-    if model.system.points is not None:
+    if model.system.points is not None or model.system.frame is not None:
         return ()
     comm, cores = layout.comm, psutil.cpu_count(logical=False) or 1
     free = comm.allreduce(free_bytes(scene), MPI.MIN)

@@ -25,6 +25,20 @@ def frame_steps(scene: Scene, n_e: int) -> list[int]:
     return np.linspace(0, steps, min(frame_count(scene, n_e), steps) + 1).round().astype(int).tolist()
 
 
+def boundaries(
+    scene: Scene, n_e: int, milestones: set[int], framed: bool, until: int | None
+) -> tuple[list[int], set[int], set[int]]:
+    """Steps at which a segment must end, and those of them with a frame or a checkpoint.
+
+    Ten of them, ``milestones``, do not depend on the options: there the energy is sampled, the same in every run.
+    """
+    steps, every = scene.time.steps, scene.output.checkpoint_every
+    frames = set(frame_steps(scene, n_e)) if framed else set[int]()
+    checkpoints = set(range(every, steps, every)) if every else set()
+    last = steps if until is None else min(until, steps)
+    return sorted({s for s in frames | checkpoints | milestones if s < last} | {last}), frames, checkpoints
+
+
 def output_recorders(
     outputs: Sequence[Output], local: Array
 ) -> tuple[list[tuple[slice, Array]], list[tuple[np.ndarray, Array]]]:

@@ -29,9 +29,18 @@ def make_midpoint(
                 f"contact needs a factor of the step, and '{solver}' has none; use time.solver = 'mumps' and "
                 "the memory for it, or a coarser mesh"
             )
+        if system.points is not None:
+            from softgrasp.fem.run.contact.finite import FiniteContactMidpoint  # few scenes pay for it
+
+            return FiniteContactMidpoint(system, dt, solver, reproducible=reproducible)
         from softgrasp.fem.run.contact.step import ContactMidpoint  # only scenes with contact pay for it
 
         return ContactMidpoint(system, dt, solver, reproducible=reproducible)
+    if system.frame is not None:
+        from softgrasp.fem.run.frame.midpoint import LinearTurningStep, TurningStep  # only such scenes pay for it
+
+        step = LinearTurningStep if system.points is None else TurningStep
+        return step(system, dt, solver, STEP_RTOL["stars"] if rtol is None else rtol, reproducible)
     if rtol is None:
         rtol = STEP_RTOL["stars"] if system.points is not None else STEP_RTOL.get(solver, STEP_RTOL["cg"])
     if system.points is None and solver in ITERATIVE:

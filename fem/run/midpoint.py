@@ -272,6 +272,19 @@ class TissueMidpoint:
         self.coupling.multTranspose(self.w_here, self.moved)
         return self.moved_array
 
+    def work(self, loads: Array, pulls: Array) -> float:
+        """Work of the loads in all of these steps, over the rows here [J]; arguments as for :meth:`works`."""
+        return 2 * float(np.einsum("ij,ij", loads, pulls[:, : loads.shape[1]]))
+
+    def works(self, loads: Array, pulls: Array) -> Array:
+        """Work 2 c'G'w of the load in each step, over the rows here, (steps,) [J].
+
+        Args:
+            loads: coefficients c of each step, (steps, n_s).
+            pulls: what :meth:`pull` returned after it, (steps, ..).
+        """
+        return np.asarray(2 * (loads * pulls[:, : loads.shape[1]]).sum(axis=1))
+
     def _move_whole(self, state: TissueState) -> PETSc.Vec:
         """The rows here of a new z, by the operations that gave the state its rows: the same bits."""
         self.z.axpy(2.0, self.w)

@@ -28,8 +28,9 @@ from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.owned import locked
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
-from softgrasp.fem.run.frames import frame_steps, output_recorders
+from softgrasp.fem.run.frames import boundaries, output_recorders
 from softgrasp.fem.run.interrupt import interruptible
+from softgrasp.fem.run.ledger import Ledger
 from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.motion import Force, ForceDrive, TableDrive, force_taken, force_values, free_table
 from softgrasp.fem.run.snapshots import make_store
@@ -41,6 +42,7 @@ from softgrasp.fem.solve.statics import equilibrium
 if TYPE_CHECKING:
     from softgrasp.fem.run.contact.general import Contact
     from softgrasp.fem.run.contact.step import ContactDrive
+    from softgrasp.fem.run.frame.drive import TurningDrive
 
 Observer = Callable[["Run"], None]
 """Called between segments and at every frame; collective, may raise to end the run."""
@@ -87,15 +89,21 @@ class Run(Stepped):
         self.outputs: tuple[Output, ...] = make_outputs(scene, system)
         self.local_outputs = np.zeros((self.steps + 1, sum(o.size for o in self.outputs)))
         self.points, self.regions = output_recorders(self.outputs, self.local_outputs)
-        self.drive: TableDrive | ForceDrive | ContactDrive = self._make_drive(force)
+        self.drive: TableDrive | ForceDrive | ContactDrive | TurningDrive
+        self.turning: TurningDrive | None = None
         self.contact: Contact | None = None
-        if scene.effects.obstacles:
+        if system.frame is not None:
+            from softgrasp.fem.run.frame.drive import make_turning_drive  # only such scenes pay for it
+
+            self.drive = self.turning = make_turning_drive(system, scene, midpoint, force)
+        elif scene.effects.obstacles:
             from softgrasp.fem.run.contact.step import make_contact  # only scenes with contact pay for it
 
-            self.drive, self.contact = make_contact(model, midpoint, self.drive, self.steps)
-        self.pulls = np.zeros((self.steps + 1, len(midpoint.pull())))
+            self.drive, self.contact = make_contact(model, midpoint, self._make_drive(force), self.steps)
+        else:
+            self.drive = self._make_drive(force)
+        self.ledger = Ledger(midpoint, self.drive.c, self.contact)
         self.milestones = set(np.linspace(0, self.steps, 11).round().astype(int).tolist())
-        self.initial_energy = self.peak_energy = 0.0
         self.residual_first = self.residual_last = 0.0
         self.begun, self.legs = 0, [0]
         self.beside: dict[str, str] = {}
@@ -115,8 +123,8 @@ class Run(Stepped):
         self.drive.solve(n, self.midpoint, self.state)
 
     def record(self, n: int) -> None:
-        """Store this rank's share of the outputs at step n, and G'w for the work of the load."""
-        self.pulls[n] = self.midpoint.pull()
+        """Store this rank's share of the outputs at step n, and of what changes the energy."""
+        self.ledger.record(n)
         z = self.state.array
         for rows, share in self.points:
             share[n] = z[rows]
@@ -132,8 +140,7 @@ class Run(Stepped):
             self.contact.start(self.state, self.drive.q[0])
         self.midpoint.start(self.state)
         self.record(0)
-        self.initial_energy = self.midpoint.energy(self.state)
-        self.peak_energy = abs(self.initial_energy)
+        self.ledger.start(self.state)
 
     def _equilibrium(self) -> Array:
         """Static displacement against the hand, (n_local,) [m]. Collective."""
@@ -142,6 +149,8 @@ class Run(Stepped):
             from softgrasp.fem.run.contact.rest import resting  # only scenes with contact pay for it
 
             return resting(self.contact, self.drive.q[0], time)
+        if self.turning is not None:
+            system = self.turning.as_it_hangs()
         return equilibrium(system, choose_solver(system.layout, time.solver, few=True)[0], time, self.settle)
 
     def take(self, ts: Any, step: int, check: bool = False) -> None:
@@ -168,36 +177,23 @@ class Run(Stepped):
         """Force on the hand in each step, see :class:`Trajectory`. Collective."""
         if self.drive.u is not None:
             return self.drive.u
-        pulls = self.pulls[1:] if self.midpoint.operators.whole else total(self.layout.comm, self.pulls[1:])
+        pulls = self.ledger.pulls
+        pulls = pulls if self.midpoint.operators.whole else total(self.layout.comm, pulls)
+        if self.turning is not None:
+            return self.turning.wrench(pulls)
         kicks, hand = (0.0, 0.0) if self.contact is None else (self.contact.table.kick, self.contact.table.hand)
-        return force_taken(self.model.system, pulls, self.drive.v, self.drive.c, self.dt, kicks) - hand
+        return force_taken(self.model.system, pulls[1:], self.drive.v, self.drive.c, self.dt, kicks) - hand
 
     def watch_energy(self) -> None:
         """Sample the energy for the scale of the drift, and stop a run that is no longer finite. Collective."""
-        energy = self.midpoint.energy(self.state)
-        if not np.isfinite(energy):
+        if not np.isfinite(self.ledger.sample(self.state)):
             raise SolverError(
                 f"{self.solver[0]}: the energy is not finite at step {self.reached}; check material, dt and force"
             )
-        self.peak_energy = max(self.peak_energy, abs(energy))
-
-    def balance(self) -> tuple[float, float]:
-        """Work of loads, sum_n 2 c_n'G'w_n, and contact, and energy dissipated since the start [J]. Collective."""
-        n = self.reached
-        work = 2 * float(np.einsum("ij,ij", self.drive.c[:n], self.pulls[1 : n + 1, : self.layout.n_s]))
-        contact = 0.0 if self.contact is None else float(self.contact.table.energy[0])
-        return self.midpoint.over_ranks(work) + contact, self.midpoint.over_ranks(self.midpoint.dissipated)
-
-    def drift(self) -> float:
-        """Energy that neither load nor damping explains, over the largest energy seen. Collective."""
-        work, lost = self.balance()
-        defect = self.midpoint.energy(self.state) - self.initial_energy - work + lost
-        scale = max(self.peak_energy, abs(work), abs(lost))
-        return abs(defect) / scale if scale > 0 else 0.0
 
     def restart_state(self) -> RestartState:
         """State of this rank for a restart; views, not copies."""
-        midpoint, n = self.midpoint, self.reached
+        midpoint, ledger, n = self.midpoint, self.ledger, self.reached
         return RestartState(
             run=self.name,
             step=n,
@@ -211,8 +207,9 @@ class Run(Stepped):
             outputs=self.local_outputs[: n + 1],
             snapshots=self.store.kept(n),
             loads=self.drive.c[:n],
-            pulls=self.pulls[: n + 1],
-            energies=np.array([midpoint.dissipated, self.initial_energy, self.peak_energy]),
+            pulls=ledger.pulls[: n + 1],
+            taken=None if ledger.taken is None else ledger.taken[: n + 1],
+            energies=np.array([midpoint.dissipated, ledger.first, ledger.peak]),
             residual_first=self.residual_first,
             forces=None if self.drive.u is None else self.drive.u[:n],
             **midpoint.restart_arrays(),
@@ -223,12 +220,12 @@ class Run(Stepped):
 
         Raises CheckpointError: the state is of another mesh numbering, or the streamed snapshots do not fit to it.
         """
-        n, midpoint = saved.step, self.midpoint
+        n, midpoint, ledger = saved.step, self.midpoint, self.ledger
         with raise_on_all_ranks(self.layout.comm):
             self.store.restore(saved.snapshots, n, saved.run)
             if len(saved.r) != len(midpoint.r_array):
                 raise CheckpointError(
-                    f"the restart file holds {len(saved.r)} rows of the right-hand side, this run "
+                    f"the restart file contains {len(saved.r)} rows of the right-hand side, this run "
                     f"{len(midpoint.r_array)}; {AGAIN}"
                 )
         self.name, self.beside = saved.run, saved.beside
@@ -237,15 +234,19 @@ class Run(Stepped):
         midpoint.r.array_w[:] = midpoint.operators.enter(saved.r)
         midpoint.pending = saved.pending
         self.drive.q[: n + 1], self.drive.v[: n + 1] = saved.hand_q, saved.hand_v
-        self.local_outputs[: n + 1], self.pulls[: n + 1] = saved.outputs, saved.pulls
+        self.local_outputs[: n + 1], ledger.pulls[: n + 1] = saved.outputs, saved.pulls
         self.drive.c[:n] = saved.loads
+        if ledger.taken is not None and saved.taken is not None:
+            ledger.taken[: n + 1] = saved.taken
         if self.drive.u is not None and saved.forces is not None:
             self.drive.u[:n] = saved.forces
-        midpoint.dissipated, self.initial_energy, self.peak_energy = saved.energies.tolist()
+        midpoint.dissipated, ledger.first, ledger.peak = saved.energies.tolist()
         self.residual_first, self.reached, self.begun = saved.residual_first, n, n
         self.legs = [*(leg for leg in saved.legs if leg < n), n]
         for vector in (self.state.z, self.state.v, midpoint.r):
             vector.stateIncrease()
+        if self.turning is not None:
+            self.turning.adopt(n, midpoint)
         midpoint.adopt(self.state)
         if self.contact is not None:
             self.contact.start(self.state, self.drive.q[n], n)
@@ -255,9 +256,11 @@ class Run(Stepped):
         """Gather the small results; the tissue stays distributed. Collective."""
         outputs, comm = self.outputs, self.layout.comm
         rigid = self.drive.q @ np.vstack([o.C_s for o in outputs]).T
-        y = rigid + total(comm, self.local_outputs * np.concatenate([np.full(o.size, o.weight) for o in outputs]))
+        y = total(comm, self.local_outputs * np.concatenate([np.full(o.size, o.weight) for o in outputs]))
+        rigid, y = (rigid, rigid + y) if self.turning is None else self.turning.world(outputs, rigid, y)
         times = self.end * np.arange(self.steps + 1) / self.steps
         snapshots = self.store.finish(times, self.drive.q, self.drive.v)
+        energy, dissipated = self.ledger.over_time()
         spent = comm.allreduce(self.seconds, MPI.MAX)
         seconds = {**self.model.watch.seconds, "steps": spent, "per_step": spent / max(self.counted, 1)}
         return Trajectory(
@@ -268,8 +271,10 @@ class Run(Stepped):
             outputs_rigid=rigid,
             columns=tuple(column for o in outputs for column in o.columns),
             snapshots=snapshots,
+            energy=energy,
+            dissipated=dissipated,
             final=self.state.array.copy(),
-            energy_drift=self.drift(),
+            energy_drift=self.ledger.drift(self.state, self.reached),
             residuals=(self.residual_first, self.residual_last),
             solve_error=self.midpoint.solve_error(),
             solver=self.solver,
@@ -279,19 +284,6 @@ class Run(Stepped):
             newton=self.midpoint.figures(),
             contact=None if self.contact is None else self.contact.record(),
         )
-
-
-def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set[int]]:
-    """Steps at which a segment must end, and those of them with a frame or a checkpoint.
-
-    Ten of them do not depend on the options: there the energy is sampled, the same in every run of a scene.
-    """
-    scene = run.model.scene
-    frames = set[int]() if options.frame is None else set(frame_steps(scene, run.layout.n_e))
-    every = scene.output.checkpoint_every
-    checkpoints = set(range(every, run.steps, every)) if every else set()
-    last = run.steps if options.until is None else min(options.until, run.steps)
-    return sorted({s for s in frames | checkpoints | run.milestones if s < last} | {last}), frames, checkpoints
 
 
 def simulate(model: Model, options: RunOptions | None = None, force: Force | None = None) -> Trajectory:
@@ -365,12 +357,13 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
     comm: MPI.Intracomm = run.model.system.layout.comm
     if options.until is not None and options.until <= run.reached and run.reached < run.steps:
         raise SceneError(f"the run is at step {run.reached} already; --until must be larger, not {options.until}")
-    boundaries, frames, checkpoints = _boundaries(run, options)
+    body = run.model.scene, run.layout.n_e, run.milestones
+    ends, frames, checkpoints = boundaries(*body, options.frame is not None, options.until)
     if options.frame is not None and run.reached == 0:
         options.frame(run)
-    last, chunk = boundaries[-1], 1
+    last, chunk = ends[-1], 1
     while run.reached < last:
-        limit = next(b for b in boundaries if b > run.reached)
+        limit = next(b for b in ends if b > run.reached)
         begin, before = time.perf_counter(), run.reached
         goal = min(limit, run.reached + chunk, run.store.limit(run.reached))
         run.take(ts, goal, check=before == 0 or goal == run.steps)

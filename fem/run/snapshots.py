@@ -115,7 +115,7 @@ class MemoryStore(NoStore):
         """Fill the first columns again. Raises CheckpointError: the run before kept others."""
         if columns.shape[1] != np.searchsorted(self.steps, step, side="right"):
             raise CheckpointError(
-                f"the restart file holds {columns.shape[1]} states up to step {step}, this run keeps others; resume "
+                f"the restart file contains {columns.shape[1]} states up to step {step}, this run keeps others; resume "
                 "with the command that was stopped, or run again without --resume"
             )
         self.Z[:, : columns.shape[1]] = columns

@@ -53,6 +53,15 @@ class Trajectory(Shown, FullOrderRun):
     By the midpoint rule it is the force at t_n + dt/2: the one applied, or the one that a prescribed motion requires
     against inertia, tissue, gravity and drag.
     """
+    energy: Array
+    """Energy of the tissue relative to the hand at each time, on every rank, (steps + 1,) [J].
+
+    (z'K z + v_z'M v_z) / 2, at finite strain W(z) + v_z'M v_z / 2: that at the start plus the work of all loads since,
+    less what damping took. It is that of the states to ``energy_drift``; a step without damping and contact does
+    nothing for it.
+    """
+    dissipated: Array
+    """Energy that damping has taken up to each time, on every rank, (steps + 1,) [J]."""
     final: Array
     """State [z; v_z] of this rank's nodes at the end, (2 n_local,) [m; m/s]."""
     energy_drift: float

@@ -189,6 +189,11 @@ class Constraints(Section):
         description="what the reduced plant may leave out at every node [m]; bound: the exact l1 bound for all forces "
         "within ``force``",
     )
+    finite_strain: bool = Field(
+        False,
+        description="with effects.finite_strain: measure what the linear plant errs under the plan, an estimate, "
+        "and plan again with it as a further margin [no unit]",
+    )
     noise: NonNegative = Field(
         3.0,
         description="with control.observer: standard deviations of every node, and of the force, that gaps and limit "

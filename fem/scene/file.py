@@ -126,6 +126,9 @@ def resolved_toml(scene: Scene) -> str:
         if key in data[section]:
             data[section][key] = str(scene.path(data[section][key]))
     replace_paths(data, lambda name: str(scene.path(name)))
+    file, colon, name = data["tissue"].get("energy", "").rpartition(":")
+    if colon:
+        data["tissue"]["energy"] = f"{scene.path(file)}:{name}"
     lines = [f"{key} = {toml_value(value)}" for key, value in data.items() if not isinstance(value, dict)]
     for section, table in data.items():
         if isinstance(table, dict):

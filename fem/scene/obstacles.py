@@ -60,7 +60,7 @@ class Obstacle(Section):
         None, description="corners in any order, all on their convex hull [m]; polygon, polyhedron"
     )
     friction: NonNegative = Field(
-        0.0, description="Coulomb coefficient of friction [1], >= 0; 2D, with effects.obstacles; 0: none"
+        0.0, description="Coulomb coefficient of friction [1], >= 0; with effects.obstacles; 0: none"
     )
     path: Dropped[Path] = Field(None, description="translation over time {velocity [m/s] or csv}; fixed unless given")
 
@@ -135,10 +135,6 @@ def check_obstacle_vectors(obstacles: list[Obstacle] | None, d: int) -> None:
         if (own := DIMENSION.get(obstacle.kind, d)) != d:
             other = next(kind for kind, each in DIMENSION.items() if each == d and KEYS[kind] == KEYS[obstacle.kind])
             raise ValueError(f"obstacle.{i}.kind is '{obstacle.kind}', of {own}D; in this {d}D scene take '{other}'")
-        if obstacle.friction > 0 and d == 3:
-            raise ValueError(
-                f"obstacle.{i}.friction is {obstacle.friction:g}; friction is there in 2D only yet, drop it"
-            )
         for key, vector in obstacle.vectors():
             if len(vector) != d:
                 raise ValueError(

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, PrivateAttr, model_validator
 
 from softgrasp.fem.scene.control import BASES, Control, ControlOutput, Loop, Reduction, Study
+from softgrasp.fem.scene.frame import check_frame
 from softgrasp.fem.scene.obstacles import Obstacle, check_obstacle_vectors, check_obstacles
 from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, NonNegative, Positive, Section, Tissue
 from softgrasp.fem.shown import Card, Shown, brief, listed
@@ -83,7 +84,12 @@ class Effects(Section):
     gravity: Dropped[Gravity] = Field(None, description="gravity {g [m/s2], hand_weight}; off unless given")
     damping: Dropped[Damping] = Field(None, description="damping {kind, beta [s], alpha [1/s], drag}; off unless given")
     reaction: bool = Field(False, description="the tissue pushes back on the hand [no unit]")
-    rotation: bool = Field(False, description="the hand also turns, by small angles [no unit]")
+    rotation: bool = Field(False, description="the hand also turns, by small angles unless frame is given [no unit]")
+    frame: Dropped[Literal["hand"]] = Field(
+        None,
+        description="axes of the equations [no unit]: 'hand' for a hand that turns by any angle, with centrifugal, "
+        "Coriolis and Euler loads and turned gravity; small angles unless given",
+    )
     finite_strain: Dropped[FiniteStrain] = Field(
         None, description="large deformation, finite strain {law, tol [1]}; off unless given"
     )
@@ -200,6 +206,8 @@ class Scene(Shown, Section):
     """results that are kept [no unit]"""
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
     _mesh_digest: str = PrivateAttr("")  # of the mesh file, once it was read
+    _energy: Any = PrivateAttr(None)  # `OwnEnergy`, once its file was run or where it was given, or None
+    _terms: tuple[Any, ...] = PrivateAttr(())  # own terms, `Term` each
     _given: Any = PrivateAttr(None)  # `GivenMesh` in the place of the file, or None
 
     def card(self) -> Card:
@@ -239,6 +247,8 @@ class Scene(Shown, Section):
         result = Scene.model_validate(data)
         result._directory = self._directory
         result._given = self._given if result.tissue.mesh == self.tissue.mesh else None
+        result._terms = self._terms
+        result._energy = self._energy if result.tissue.energy == self.tissue.energy else None
         return result
 
     def path(self, name: str) -> Path:
@@ -248,8 +258,9 @@ class Scene(Shown, Section):
     @property
     def files(self) -> list[Path]:
         """Files that the scene names, absolute."""
+        energy = None if self.tissue.energy in (None, "given") else self.tissue.energy.rpartition(":")[0]
         paths = [obstacle.path.csv for obstacle in self.obstacle or [] if obstacle.path is not None]
-        return [self.path(name) for name in (self.tissue.mesh, self.motion.csv, *paths) if name is not None]
+        return [self.path(name) for name in (self.tissue.mesh, self.motion.csv, energy, *paths) if name is not None]
 
     def refuse_contact(self, what: str) -> None:
         """Refuse what contact is not part of. Raises SceneError: ``effects.obstacles`` is on."""
@@ -261,16 +272,28 @@ class Scene(Shown, Section):
                 "--set obstacle=false for a model without contact"
             )
 
+    def refuse_frame(self, what: str) -> None:
+        """Refuse what the frame of the hand is not part of. Raises SceneError: ``effects.frame`` is given."""
+        if self.effects.frame is not None:
+            from softgrasp.fem.errors import SceneError  # imports MPI, which the models do without
+
+            raise SceneError(
+                f"scene '{self.name}': {what} cannot go with effects.frame = 'hand' yet, whose equations are not "
+                "linear in the hand; use --set effects.frame=false for small angles"
+            )
+
     @model_validator(mode="after")
     def _check(self) -> Scene:
         effects = self.effects
         if effects.rotation and self.hand.inertia is None:
             raise ValueError("hand.inertia is missing; effects.rotation needs it")
-        if effects.rotation and effects.finite_strain is not None:
+        if effects.rotation and effects.finite_strain is not None and effects.frame is None:
             raise ValueError(
                 "effects.finite_strain cannot go with effects.rotation, whose linearised turns would stretch the "
-                "tissue; set one of them to false"
+                "tissue; set one of them to false, or effects.frame to 'hand'"
             )
+        if effects.frame is not None:
+            check_frame(effects, self.tissue)
         if self.time.start == "equilibrium" and effects.gravity is None and not effects.obstacles:
             raise ValueError("time.start is 'equilibrium' but effects.gravity is off; use 'rest' or give gravity")
         if self.contact.facet_tag is not None and self.tissue.mesh is None:
@@ -298,10 +321,24 @@ def _check_contact(scene: Scene) -> None:
             "tissue.refine.tolerance cannot go with effects.obstacles, which its estimate does not include; drop it"
         )
     if scene.effects.finite_strain is not None:
-        raise ValueError("effects.obstacles cannot go with effects.finite_strain yet; set one of them to false")
+        _check_finite(scene, scene.obstacle)
     if scene.time.solver in ("cg", "stars"):
         raise ValueError(
             f"time.solver is '{scene.time.solver}'; effects.obstacles needs a factor, use 'auto' or 'cholesky'"
+        )
+
+
+def _check_finite(scene: Scene, obstacles: list[Obstacle]) -> None:
+    """ValueError for what contact at finite strain cannot go with."""
+    if any(obstacle.friction for obstacle in obstacles):
+        raise ValueError("obstacle has friction, which effects.finite_strain does not have yet; drop friction")
+    if scene.effects.reaction:
+        raise ValueError(
+            "effects.reaction cannot go with effects.obstacles at finite strain yet; set one of the three to false"
+        )
+    if scene.time.start == "equilibrium":
+        raise ValueError(
+            "time.start is 'equilibrium'; with effects.obstacles and effects.finite_strain a run starts at 'rest'"
         )
 
 

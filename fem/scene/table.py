@@ -30,11 +30,16 @@ def read_motion(scene: Scene, n_s: int) -> tuple[NDArray[Any], NDArray[Any]]:
         scene.directory / name, n_s, scene.time_end, also=POSE if posed else None,
         meaning="one per hand degree of freedom" + ", or x, y, z and a quaternion w, x, y, z" * posed,
     )  # fmt: skip
-    return times, values if values.shape[1] == n_s else _from_poses(values, f"motion.csv: {scene.directory / name}")
+    if values.shape[1] == n_s:
+        return times, values
+    return times, _from_poses(values, f"motion.csv: {scene.directory / name}", scene.effects.frame is not None)
 
 
-def _from_poses(poses: NDArray[Any], name: str) -> NDArray[Any]:
-    """Displacement and rotation vector (m, 6) [m, rad] from the first of the poses (m, 7)."""
+def _from_poses(poses: NDArray[Any], name: str, onward: bool) -> NDArray[Any]:
+    """Displacement and rotation vector (m, 6) [m, rad] from the first of the poses (m, 7).
+
+    ``onward``: a rotation vector is the one nearest to the row before, of more than half a turn too.
+    """
     from scipy.spatial.transform import Rotation  # poses alone pay for it
 
     norms = np.linalg.norm(poses[:, 3:], axis=1)
@@ -45,7 +50,18 @@ def _from_poses(poses: NDArray[Any], name: str) -> NDArray[Any]:
             "w, x, y, z"
         )
     turns = Rotation.from_quat(poses[:, [4, 5, 6, 3]])
-    return np.hstack([poses[:, :3] - poses[0, :3], (turns * turns[0].inv()).as_rotvec()])
+    angles = (turns * turns[0].inv()).as_rotvec()
+    if onward:
+        from softgrasp.fem.frame.rotation import rotation_matrix, rotation_vector  # such scenes alone pay for it
+
+        for i in range(1, len(angles)):
+            angles[i] = rotation_vector(rotation_matrix(angles[i]), angles[i - 1])
+            if np.linalg.norm(angles[i] - angles[i - 1]) > np.pi:
+                raise SceneError(
+                    f"{name} turns the hand too far from data row {i} to {i + 1}, or past a whole turn about another "
+                    "axis; give more rows, or displacements and rotation vectors"
+                )
+    return np.hstack([poses[:, :3] - poses[0, :3], angles])
 
 
 def read_csv(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
@@ -15,6 +16,7 @@ Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Box = Annotated[list[list[float]], Field(min_length=2, max_length=2)]
 Label = Annotated[str, Field(max_length=80, pattern=r"^[^$\\\n]*$")]  # what figures draw, where $ begins a formula
+TAKEN = ("mu", "lam", "lambda", "rho", "beta", "rest", "names", "used", "x", "d")  # names of other things
 ROUNDING = 1e-9  # static solves on graded meshes lose up to seven of sixteen digits
 Side = Literal["x-", "x+", "y-", "y+", "z-", "z+", "left", "right", "bottom", "top", "front", "back"]
 
@@ -138,6 +140,9 @@ class Layer(Section):
     box: Box | None = Field(None, description="[[lo], [hi]] [m]; cells whose midpoint lies inside; excludes tag")
     material: Material = Field(description="library name, {lambda, mu, rho} or {young, poisson, rho} [Pa, kg/m3]")
     beta: NonNegative | None = Field(None, description="Kelvin-Voigt time of this layer [s]; else the scene's")
+    parameters: dict[str, float] = Field(
+        default_factory=dict, description="own values of tissue.parameters, by name [units of the energy]"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Layer:
@@ -211,6 +216,14 @@ class Tissue(Section):
     order: Literal[1, 2, 3] = Field(1, description="polynomial order of the displacement [1]")
     thickness: Positive = Field(1.0, description="thickness out of the plane [m], 2D only")
     material: Material = Field(description="library name, {lambda, mu, rho} or {young, poisson, rho} [Pa, kg/m3]")
+    energy: Dropped[str] = Field(
+        None,
+        description='energy in UFL, "file.py:function", the file relative to the scene; it is run as a Python program '
+        "[no unit]; off unless given",
+    )
+    parameters: dict[str, float] = Field(
+        default_factory=dict, description="parameters of the energy, by name [units of the energy]"
+    )
     layers: dict[str, Layer] = Field(default_factory=dict, description="parts with another material, by name [no unit]")
     refine: Dropped[Refine] = Field(
         None, description="graded cells {tolerance, grading, method, contact, passes, most} [no unit]; off unless given"
@@ -220,6 +233,7 @@ class Tissue(Section):
     def _check(self) -> Tissue:
         if "tissue" in self.layers:
             raise ValueError("layers.tissue is the name of the cells outside of all layers; give it another name")
+        self._check_energy()
         if self.mesh is not None:
             given = [key for key in ("size", "cells", "origin") if getattr(self, key) is not None]
             if self.refine is not None and self.refine.method == "lines":
@@ -240,6 +254,24 @@ class Tissue(Section):
             if layer.tag is not None:
                 raise ValueError(f"layers.{name}.tag needs tissue.mesh; on a structured box give box")
         return self
+
+    def _check_energy(self) -> None:
+        """ValueError unless parameters and energy fit each other."""
+        if self.energy is None and (self.parameters or any(layer.parameters for layer in self.layers.values())):
+            raise ValueError("parameters needs tissue.energy; give the energy that has them, or drop them")
+        if self.energy is not None and self.energy != "given" and not re.fullmatch(r".+\.py:[A-Za-z_]\w*", self.energy):
+            raise ValueError(f"energy is '{self.energy}'; write a file and its function, as in \"law.py:W\"")
+        for key in self.parameters:
+            if not key.isidentifier() or key.startswith("_") or key in TAKEN:
+                raise ValueError(
+                    f"parameters has '{key}'; a name is a word of letters and digits, none of {', '.join(TAKEN)}"
+                )
+        for name, layer in self.layers.items():
+            for key in layer.parameters:
+                if key not in self.parameters:
+                    raise ValueError(
+                        f"layers.{name}.parameters has '{key}', which tissue.parameters lacks; give it there too"
+                    )
 
 
 class Contact(Section):

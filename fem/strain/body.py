@@ -10,10 +10,10 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.material import LayerMaterial
-from softgrasp.fem.petsc import Array, PETSc, to_scipy
+from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.strain.compiled import LANES, library
-from softgrasp.fem.strain.laws import LAWS, Start, double_dot, green, stretches, volume_change
-from softgrasp.fem.strain.points import QuadraturePoints
+from softgrasp.fem.strain.laws import LAWS, Start, double_dot, green, stretches
+from softgrasp.fem.strain.points import QuadraturePoints, node_arrays
 
 DECLARATION = """
 void softgrasp_start(int d, int k, int p, const int *node, const double *G, const double *z, double *H0, double *j0,
@@ -43,16 +43,7 @@ class Kernel:
 
     def __init__(self, points: QuadraturePoints, lam: Array, mu: Array, code: Any) -> None:
         (ffi, self.c), d, Q = code, points.d, len(points.vol)
-        B = to_scipy(points.B)
-        counts = np.diff(B.indptr[: Q + 1])  # the rows of a point have the same nodes
-        point, k, p = np.repeat(np.arange(Q), counts), int(counts.max(initial=0)), -(-Q // LANES) * LANES
-        place = np.arange(len(point)) - np.repeat(B.indptr[:Q], counts)
-        node, G = np.zeros((p, k), dtype=np.intc), np.zeros((p, k, d))
-        node[point, place] = B.indices[: len(point)] // d
-        for j in range(d):
-            G[point, place, j] = B.data[B.indptr[j * Q] : B.indptr[(j + 1) * Q]]
-        node = np.ascontiguousarray(node.reshape(-1, LANES, k).swapaxes(1, 2))
-        G = np.ascontiguousarray(G.reshape(-1, LANES, k, d).transpose(0, 2, 3, 1))
+        node, G, k, p = node_arrays(points, LANES)
         H, change, log, J = np.zeros((d, d, p)), np.zeros(p), np.zeros(p), np.zeros(p)
         self.begin, self.J = Start(H[:, :, :Q], change[:Q], log[:Q]), J[:Q]
 
@@ -60,7 +51,7 @@ class Kernel:
             return ffi.from_buffer("int[]" if x.dtype == np.intc else "double[]", x)
 
         self.at = at
-        self.law = list(LAWS).index(points.law)
+        self.law = list(LAWS.values()).index(points.laws)
         self.size = (d, k, p, at(node), at(G))
         self.points = tuple(at(np.pad(x, (0, p - Q))) for x in (points.vol, lam, mu))
         self.state, self.end = (at(H), at(change), at(log)), at(J)
@@ -96,7 +87,7 @@ class HyperelasticBody:
         self, points: QuadraturePoints, materials: tuple[LayerMaterial, ...], pattern: PETSc.Mat | None = None
     ) -> None:
         self.points, self.law = points, points.laws
-        self.lam, self.mu = points.lame(materials)
+        self.moduli = points.moduli(materials)
         d, Q = points.d, len(points.vol)
         self.shape = (d, d, Q)
         self.h = points.B.createVecLeft()
@@ -106,14 +97,18 @@ class HyperelasticBody:
         self.product: PETSc.Mat | None = None
         self.K: PETSc.Mat | None = None
         self.rounding = self._rounding()
-        code = compiled() if points.B.comm.size == 1 else None
-        self.kernel = None if code is None else Kernel(points, self.lam, self.mu, code)
+        self.kernel: Any = None
+        if points.B.comm.size == 1 and points.own is not None:
+            self.kernel = self.law.kernel(points, self.moduli)
+        elif points.B.comm.size == 1 and (code := compiled()) is not None:
+            lam, mu = self.moduli
+            self.kernel = Kernel(points, lam, mu, code)
 
     def _rounding(self) -> float:
         B, force = self.points.B, self.points.B.createVecRight()
         indptr, columns, values = B.getValuesCSR()
         size = PETSc.Mat().createAIJ(B.getSizes(), csr=(indptr, columns, np.abs(values)), comm=B.comm)
-        self.H[:] = self.points.vol * self.mu
+        self.H[:] = self.points.vol * self.law.stiffness(*self.moduli)
         self.h.stateIncrease()
         size.multTranspose(self.h, force)
         value = float(np.finfo(float).eps) * float(force.norm())
@@ -128,15 +123,15 @@ class HyperelasticBody:
 
     def energy(self, z: PETSc.Vec) -> float:
         """This rank's share of W(z) [J]. Collective."""
-        return float(self.points.vol @ self.law.energy(self.gradient(z), self.lam, self.mu))
+        return float(self.points.vol @ self.law.energy(self.gradient(z), *self.moduli))
 
     def force(self, z: PETSc.Vec, f: PETSc.Vec) -> None:
         """Force f = B' (vol P(B z)) [N]. Collective."""
-        self._collect(self.law.stress(self.gradient(z), self.lam, self.mu), f)
+        self._collect(self.law.stress(self.gradient(z), *self.moduli), f)
 
     def sound(self, z: PETSc.Vec) -> bool:
         """Whether the law has a tangent at z in the points of this rank. Collective."""
-        return not self.law.barrier or bool(volume_change(self.gradient(z)).min(initial=0.0) > -1)
+        return self.law.defined(self.gradient(z), *self.moduli)
 
     def start(self, z: PETSc.Vec) -> Start:
         """The law at the start of a step; valid until the next call. Collective."""
@@ -149,8 +144,8 @@ class HyperelasticBody:
         """
         if self.kernel is not None:
             self.J = self.kernel.J
-            return self.kernel.force(w.array_r, f.array_w)
-        P, self.J = self.law.step(start, self.gradient(w), self.lam, self.mu)
+            return bool(self.kernel.force(w.array_r, f.array_w))
+        P, self.J = self.law.step(start, self.gradient(w), *self.moduli)
         self._collect(P if P is not None else self.H, f)  # all ranks take part in the product
         return P is not None
 
@@ -198,7 +193,7 @@ class HyperelasticBody:
     def tangent(self, z: PETSc.Vec) -> PETSc.Mat:
         """K(z) = B' (vol A) B with ``pattern``; the next call overwrites it. Collective."""
         d, Q = self.points.d, self.shape[2]
-        moduli = self.law.tangent(self.gradient(z), self.lam, self.mu)
+        moduli = self.law.tangent(self.gradient(z), *self.moduli)
         moduli *= self.points.vol
         values = np.ascontiguousarray(moduli.reshape(d * d, d * d, Q).transpose(0, 2, 1)).ravel()
         if self.A is None:

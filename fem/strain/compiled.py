@@ -22,15 +22,22 @@ FLAGS = (f"-DLANES={LANES}", "-O3", "-march=native", "-fno-math-errno", "-fno-tr
 
 
 @functools.cache
-def library(source: Path, declaration: str, otherwise: str) -> Any:
+def library(
+    source: Path, declaration: str, otherwise: str, header: Path | None = None, defined: tuple[str, ...] = ()
+) -> Any:
     """(ffi, library) of a C source; None, with a warning, where it cannot be compiled.
 
-    ``declaration``: of its functions, for cffi; ``otherwise``: the way that is used instead, begins the warning.
+    Args:
+        source: C file.
+        declaration: of its functions, for cffi.
+        otherwise: the way that is used instead, begins the warning.
+        header: file beside law.h that it includes.
+        defined: macros, NAME=VALUE.
     """
     try:
         from cffi import FFI  # it comes with FFCx, not with every online machine
 
-        path = _shared(source)
+        path = _shared(source, header, tuple(f"-D{macro}" for macro in defined))
         ffi = FFI()
         ffi.cdef(declaration)
         return ffi, ffi.dlopen(str(path))
@@ -45,31 +52,40 @@ def library(source: Path, declaration: str, otherwise: str) -> Any:
         return None
 
 
-def _shared(source: Path) -> Path:
+def _shared(source: Path, header: Path | None, macros: tuple[str, ...]) -> Path:
     """The shared library in the cache folder, made there unless it is there, named by hashes of source and machine."""
     compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
         raise OSError("there is no C compiler")
-    texts = source.read_text(), (LAWS / "law.h").read_text(), compiler, *FLAGS, _processor()
+    folders = [f"-I{folder}" for folder in (LAWS, *([] if header is None else [header.parent]))]
+    files = [source, LAWS / "law.h", *([] if header is None else [header])]
+    texts = *(file.read_text() for file in files), compiler, *FLAGS, *macros, _processor()
     key = hashlib.sha256("\0".join(texts).encode()).hexdigest()[:20]
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "softgrasp"
-    with suppress(OSError):
-        root.mkdir(parents=True, exist_ok=True)
-    if not os.access(root, os.W_OK):
-        root = Path(tempfile.mkdtemp(prefix="softgrasp-"))  # of this process alone
-        atexit.register(shutil.rmtree, root, ignore_errors=True)
+    root = cache_folder()
     path = root / f"{source.stem}-{key}.so"
     if not path.exists():
         # several ranks may compile at once: each its own file, and the last one stays
         handle, name = tempfile.mkstemp(dir=root, suffix=".so")
         os.close(handle)
-        command = [*compiler.split(), *FLAGS, f"-I{LAWS}", str(source), "-o", name, "-lm"]
+        command = [*compiler.split(), *FLAGS, *macros, *folders, str(source), "-o", name, "-lm"]
         try:
             subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
             os.replace(name, path)
         finally:
             Path(name).unlink(missing_ok=True)
     return path
+
+
+@functools.cache
+def cache_folder() -> Path:
+    """Folder of what is compiled; one of this process alone where that of the user cannot be written."""
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "softgrasp"
+    with suppress(OSError):
+        root.mkdir(parents=True, exist_ok=True)
+    if not os.access(root, os.W_OK):
+        root = Path(tempfile.mkdtemp(prefix="softgrasp-"))
+        atexit.register(shutil.rmtree, root, ignore_errors=True)
+    return root
 
 
 def _processor() -> str:

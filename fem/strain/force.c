@@ -3,21 +3,11 @@
    nodes that follow the hand, have G = 0. Arrays of p points, p a multiple of LANES; H0 is (d d, p). See body.py. */
 #include "law.h"
 
-INLINE void gradient(int d, int k, const int *node, const double *G, const double *z, Lane *H) {
-  for (int c = 0; c < d * d; c++) EACH H[c][l] = 0;
-  for (int a = 0; a < k; a++, node += LANES, G += d * LANES)
-    for (int i = 0; i < d; i++) {
-      Lane x;
-      EACH x[l] = z[node[l] * d + i];
-      for (int j = 0; j < d; j++) EACH H[i * d + j][l] += x[l] * G[j * LANES + l];
-    }
-}
-
 INLINE void start_as(int d, int k, int p, const int *node, const double *G, const double *z, double *H0, double *j0,
                      double *l0) {
   for (int q = 0; q < p; q += LANES, node += k * LANES, G += k * d * LANES) {
     Lane H[9], x;
-    gradient(d, k, node, G, z, H);
+    node_gradient(d, k, node, G, z, H);
     volume(d, H, j0 + q);
     log_quotient(j0 + q, x);
     EACH l0[q + l] = x[l] * j0[q + l];
@@ -32,7 +22,7 @@ INLINE int force_as(int law, int d, int k, int p, const int *node, const double 
   for (int i = 0; i < n; i++) f[i] = 0;
   for (int q = 0; q < p; q += LANES, node += k * LANES, G += k * d * LANES) {
     Lane h[9], H[9], P[9];
-    gradient(d, k, node, G, w, h);
+    node_gradient(d, k, node, G, w, h);
     for (int c = 0; c < d * d; c++) EACH H[c][l] = H0[(size_t)c * p + q + l];
     if (stress(law, d, H, j0 + q, l0 + q, h, lam + q, mu + q, P, J + q) < LANES) fine = 0;
     if (!fine) continue; /* only J is of interest */

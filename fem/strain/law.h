@@ -20,6 +20,17 @@ INLINE void cofactor(int d, const Lane *F, Lane *C) {
     }
 }
 
+/* H = grad z of the nodes of LANES points; the layout is that of fem/strain/force.c. */
+INLINE void node_gradient(int d, int k, const int *node, const double *G, const double *z, Lane *H) {
+  for (int c = 0; c < d * d; c++) EACH H[c][l] = 0;
+  for (int a = 0; a < k; a++, node += LANES, G += d * LANES)
+    for (int i = 0; i < d; i++) {
+      Lane x;
+      EACH x[l] = z[node[l] * d + i];
+      for (int j = 0; j < d; j++) EACH H[i * d + j][l] += x[l] * G[j * LANES + l];
+    }
+}
+
 /* J - 1 of I + H: trace, principal minors and determinant of H lose no digit. */
 INLINE void volume(int d, const Lane *H, double *j) {
   Lane C[9];

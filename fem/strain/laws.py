@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,23 +87,31 @@ class Start:
 
 
 class Law(ABC):
-    """A law of the material; lam, mu [Pa] are numbers or (Q,)."""
+    """A law of the material; the moduli of a point, lam and mu [Pa] of the built-in laws, are numbers or (Q,)."""
 
-    name: LawName  # name of the law in scenes
+    name: str  # name of the law in scenes
     barrier = True  # W has no value where J <= 0
     least_stretch = 0.0  # principal stretch below which the law is no model of a solid; 0 where there is none
 
     @abstractmethod
-    def energy(self, H: Array, lam: Array, mu: Array) -> Array:
+    def energy(self, H: Array, *moduli: Array) -> Array:
         """W(I + H) [J/m^d], (Q,), without cancellation at small strain."""
 
     @abstractmethod
-    def stress(self, H: Array, lam: Array, mu: Array) -> Array:
+    def stress(self, H: Array, *moduli: Array) -> Array:
         """First Piola-Kirchhoff stress P = dW/dF [Pa], (d, d, Q)."""
 
     @abstractmethod
-    def tangent(self, H: Array, lam: Array, mu: Array) -> Array:
+    def tangent(self, H: Array, *moduli: Array) -> Array:
         """A = dP/dF [Pa], (d, d, d, d, Q) with A[i, J, k, L] = dP_iJ/dF_kL."""
+
+    def stiffness(self, *moduli: Array) -> Array:
+        """Size of the terms of the stress, of which rounding leaves a part [Pa], (Q,): mu of the built-in laws."""
+        return moduli[1]
+
+    def kernel(self, points: Any, moduli: tuple[Array, ...]) -> Any:
+        """Compiled steps of an own law as `body.Kernel` has them; None where there is no compiler."""
+        return None
 
     def start(self, H: Array) -> Start:
         """Values at H_0 that :meth:`step` needs."""
@@ -111,30 +119,37 @@ class Law(ABC):
         with np.errstate(invalid="ignore", divide="ignore"):  # an inverted start is refused by its J
             return Start(H.copy(), j, np.log1p(j))
 
+    def defined(self, H: Array, *moduli: Array) -> bool:
+        """Whether the law has a tangent at H in all points."""
+        return not self.barrier or bool(volume_change(H).min(initial=0.0) > -1)
+
     @abstractmethod
-    def step(self, start: Start, half: Array, lam: Array, mu: Array) -> tuple[Array | None, Array]:
+    def step(self, start: Start, half: Array, *moduli: Array) -> tuple[Array | None, Array]:
         """Stress P of the discrete gradient from H_0 to H_0 + 2 half and J_1, (Q,); None where some J_1 forbids it."""
 
 
 class NeoHooke(Law):
     """W = mu/2 (|F|^2 - d) + g(J), g(J) = -mu ln J + lam/2 (ln J)^2, or with lam/2 (J - 1)^2 where quadratic."""
 
-    def __init__(self, name: LawName, quadratic: bool) -> None:
+    def __init__(self, name: str, quadratic: bool) -> None:
         self.name, self.quadratic = name, quadratic
 
-    def energy(self, H: Array, lam: Array, mu: Array) -> Array:
+    def energy(self, H: Array, *moduli: Array) -> Array:
         """See :class:`Law`: mu/2 (|H|^2 + 2 tr H - 2 j) + (g(J) + mu j), where both terms are of second order."""
+        lam, mu = moduli
         trace, rest = invariants(H)
         j = trace + rest
         return np.asarray(mu * (double_dot(H, H) / 2 - rest) + mu * (j - np.log1p(j)) + self.volume_energy(j, lam))
 
-    def stress(self, H: Array, lam: Array, mu: Array) -> Array:
+    def stress(self, H: Array, *moduli: Array) -> Array:
         """See :class:`Law`: P = mu F + g'(J) Cof F."""
+        lam, mu = moduli
         F = identity(H)
         return np.asarray(mu * F + self.slopes(volume_change(H), lam, mu)[0] * cofactor(F))
 
-    def tangent(self, H: Array, lam: Array, mu: Array) -> Array:
+    def tangent(self, H: Array, *moduli: Array) -> Array:
         """See :class:`Law`: A = mu I + g'' Cof F (x) Cof F + g' dCof F/dF."""
+        lam, mu = moduli
         d, F = len(H), identity(H)
         C, (p, q) = cofactor(F), self.slopes(volume_change(H), lam, mu)
         A = C[:, :, None, None] * (q * C)
@@ -146,8 +161,9 @@ class NeoHooke(Law):
                     A[i, :, k, :] += p * _turned(F, i, k)
         return A
 
-    def step(self, start: Start, half: Array, lam: Array, mu: Array) -> tuple[Array | None, Array]:
+    def step(self, start: Start, half: Array, *moduli: Array) -> tuple[Array | None, Array]:
         """See :class:`Law`."""
+        lam, mu = moduli
         F = identity(start.H + half)
         C = cofactor(F)
         if len(half) == 3:
@@ -194,21 +210,24 @@ class NeoHooke(Law):
 class StVenantKirchhoff(Law):
     """W = mu E:E + lam/2 (tr E)^2: softens in compression, so it is refused where it folds."""
 
-    name: LawName = "stvk"
+    name = "stvk"
     barrier = False
     least_stretch = LEAST_STRETCH
 
-    def energy(self, H: Array, lam: Array, mu: Array) -> Array:
+    def energy(self, H: Array, *moduli: Array) -> Array:
         """See :class:`Law`."""
+        lam, mu = moduli
         E = green(H)
         return np.asarray(mu * double_dot(E, E) + lam / 2 * np.einsum("iiq->q", E) ** 2)
 
-    def stress(self, H: Array, lam: Array, mu: Array) -> Array:
+    def stress(self, H: Array, *moduli: Array) -> Array:
         """See :class:`Law`: P = F S."""
+        lam, mu = moduli
         return _push(identity(H), second_stress(green(H), lam, mu))
 
-    def tangent(self, H: Array, lam: Array, mu: Array) -> Array:
+    def tangent(self, H: Array, *moduli: Array) -> Array:
         """See :class:`Law`: A_iJkL = lam F_iJ F_kL + mu (F_iL F_kJ + (F F')_ik d_JL) + d_ik S_JL."""
+        lam, mu = moduli
         F, S, one = identity(H), second_stress(green(H), lam, mu), np.eye(len(H))
         A = np.einsum("iLq,kJq->iJkLq", F, F)
         A += np.einsum("imq,kmq,JL->iJkLq", F, F, one)
@@ -216,8 +235,9 @@ class StVenantKirchhoff(Law):
         A += lam * F[:, :, None, None] * F
         return np.asarray(A + np.einsum("ik,JLq->iJkLq", one, S))
 
-    def step(self, start: Start, half: Array, lam: Array, mu: Array) -> tuple[Array | None, Array]:
+    def step(self, start: Start, half: Array, *moduli: Array) -> tuple[Array | None, Array]:
         """See :class:`Law`."""
+        lam, mu = moduli
         end = start.H + 2 * half
         E = (green(start.H) + green(end)) / 2
         return _push(identity(start.H + half), second_stress(E, lam, mu)), 1 + volume_change(end)
@@ -263,7 +283,7 @@ def _turned(F: Array, i: int, k: int) -> Array:
     return result
 
 
-LAWS: dict[LawName, Law] = {
+LAWS: dict[str, Law] = {
     law.name: law for law in (NeoHooke("neo-hooke", False), NeoHooke("neo-hooke-quadratic", True), StVenantKirchhoff())
 }
 """The laws by the name that a scene gives them; the first is the default."""

@@ -5,7 +5,9 @@ f(z) = B' (vol P(B z)) and K(z) = B' (vol A(B z)) B, for any element order, dime
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc, rows_on_all, to_scipy, whole_copy
-from softgrasp.fem.strain.laws import LAWS, Law, LawName
+from softgrasp.fem.strain.laws import LAWS, Law
 
 Ints = NDArray[np.intp]
 
@@ -32,16 +34,21 @@ class QuadraturePoints:
     cell: Ints  # global number of the cell of each point, (Q,)
     X: Array  # place of each point at rest [m], (Q, d)
     d: int  # space dimension
-    law: LawName  # name of the material's law
+    law: str | Law  # name of the material's law, or a law of the user's own
     tol: float  # relative tolerance of the equations of a step [1]
+    own: Callable[[QuadraturePoints, tuple[LayerMaterial, ...]], tuple[Array, ...]] | None = (
+        None  # moduli of an own law
+    )
 
     @property
     def laws(self) -> Law:
         """The law itself."""
-        return LAWS[self.law]
+        return LAWS[self.law] if isinstance(self.law, str) else self.law
 
-    def lame(self, materials: tuple[LayerMaterial, ...]) -> tuple[Array, Array]:
-        """Lame parameters lambda and mu of every point [Pa], (Q,) each."""
+    def moduli(self, materials: tuple[LayerMaterial, ...]) -> tuple[Array, ...]:
+        """What the law needs of every point beside H, (Q,) each: Lame's lambda and mu [Pa], or the own law's inputs."""
+        if self.own is not None:
+            return self.own(self, materials)
         lam, mu = (np.array([getattr(m, key) for m in materials]) for key in ("lam", "mu"))
         return lam[self.layer], mu[self.layer]
 
@@ -69,6 +76,24 @@ def make_gradient(comm: MPI.Intracomm, gradients: Array, nodes: Ints, columns: t
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
     B = scipy.sparse.coo_matrix(entries, shape=(d * d * Q, columns[1])).tocsr()  # keeps zeros: the pattern is that of K
     return _petsc(B, ((d * d * Q, None), columns), d, comm)
+
+
+def node_arrays(points: QuadraturePoints, lanes: int) -> tuple[Any, Array, int, int]:
+    """Nodes of the points and gradients of their shape functions, by chunks of ``lanes`` points, B on one rank.
+
+    Returns node (p, k) and dN_a / dX_j (p, k, d) with the points of a chunk last, as `force.c` reads them, k and p.
+    """
+    B, d, Q = to_scipy(points.B), points.d, len(points.vol)
+    counts = np.diff(B.indptr[: Q + 1])  # the rows of a point have the same nodes
+    point, k, p = np.repeat(np.arange(Q), counts), int(counts.max(initial=0)), -(-Q // lanes) * lanes
+    place = np.arange(len(point)) - np.repeat(B.indptr[:Q], counts)
+    node, G = np.zeros((p, k), dtype=np.intc), np.zeros((p, k, d))
+    node[point, place] = B.indices[: len(point)] // d
+    for j in range(d):
+        G[point, place, j] = B.data[B.indptr[j * Q] : B.indptr[(j + 1) * Q]]
+    node = np.ascontiguousarray(node.reshape(-1, lanes, k).swapaxes(1, 2))
+    G = np.ascontiguousarray(G.reshape(-1, lanes, k, d).transpose(0, 2, 3, 1))
+    return node, G, k, p
 
 
 def whole_points(points: QuadraturePoints, comm: MPI.Intracomm, columns: Ints | None = None) -> QuadraturePoints:

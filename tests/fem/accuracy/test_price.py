@@ -24,10 +24,10 @@ def block(comm: MPI.Intracomm, *changes: str, name: str = "block_3d") -> Model:
     return build(load_scene(name, changes), comm=comm)
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)  # seams between two ranks make the stars inexact; a third makes none of another kind
 @pytest.mark.parametrize(
     ("order", "cells", "lines", "iterations", "off"),
-    [(1, [4, 3, 8], EVEN, 3, 0.02), (2, [4, 3, 8], EVEN, 3, 0.02), (1, [4, 3, 8], GRADED, 5, 0.02),
+    [(1, [4, 3, 8], EVEN, 3, 0.02), (2, [2, 2, 4], EVEN, 3, 0.02), (1, [4, 3, 8], GRADED, 5, 0.02),
      (2, [2, 2, 4], GRADED, 5, 0.02)],
 )  # fmt: skip
 def test_surpluses_tell_what_solves_on_the_next_order_tell(
@@ -79,8 +79,8 @@ def test_counted_seconds_are_those_of_the_processor(comm: MPI.Intracomm) -> None
 
 @pytest.mark.parametrize(
     ("cells", "changes"),
-    [([4, 3, 6], ["tissue.order=2"]), ([6, 4, 10], ["tissue.order=2"]), ([4, 3, 6], ["tissue.order=3"]),
-     ([6, 4, 12], ["tissue.order=2", EVEN]), ([6, 4, 12], ["tissue.order=1", EVEN])],
+    [([4, 3, 6], ["tissue.order=2"]), ([5, 4, 8], ["tissue.order=2"]), ([4, 2, 4], ["tissue.order=3"]),
+     ([4, 4, 8], ["tissue.order=2", EVEN]), ([6, 4, 12], ["tissue.order=1", EVEN])],
     ids=["lines", "finer lines", "cubic", "even", "linear"],
 )  # fmt: skip
 def test_coarser_cells_tell_the_error_of_a_box(comm: MPI.Intracomm, cells: list[int], changes: list[str]) -> None:

@@ -57,11 +57,11 @@ def test_gravity() -> None:
     assert gate.number == 0.08
     assert gate.matters
     assert "sag by 0.5 m, 0.25 of its length 2 m" in gate.sentence
-    assert "|grad z| is at most 0.08 in 99% of the body: the theory holds" in gate.sentence
+    assert "|grad z| is at most 0.08 in 99 % of the body: the theory holds" in gate.sentence
     weak = Sag((3.0, -4.0), 0.01, Gradient(0.2, 0.009, 0.001, 0.005))
     assert not EFFECTS["gravity"].gate(problem_of(on, sag=weak)).matters, "steep at the edge of the contact zone only"
     steep = Sag((3.0, -4.0), 1.0, Gradient(0.5, 0.3, 0.25, 0.2))
-    assert "does not hold, 25% of the body" in EFFECTS["gravity"].gate(problem_of(on, sag=steep)).sentence
+    assert "does not hold, 25 % of the body" in EFFECTS["gravity"].gate(problem_of(on, sag=steep)).sentence
     off = EFFECTS["gravity"].gate(problem_of(scene_of()))
     assert off.sentence.startswith("Off")
     assert off.proviso == "if its numbers are in SI units"
@@ -139,7 +139,7 @@ def test_reaction() -> None:
     assert not moved.matters, "a prescribed motion feels no reaction"
     pushed = EFFECTS["reaction"].gate(problem_of(scene_of(hand=hand, motion=force)))
     assert pushed.matters
-    assert "9.1%" in pushed.sentence  # 0.1 / 1.1
+    assert "9.1 %" in pushed.sentence  # 0.1 / 1.1
     heavy = EFFECTS["reaction"].gate(problem_of(scene_of(hand={"mass": 100.0}, motion=force)))
     assert not heavy.matters
 
@@ -218,13 +218,14 @@ def test_operators_named_only_when_on() -> None:
             "damping": {"kind": "kelvin-voigt", "beta": 0.1},
             "reaction": True,
             "rotation": True,
+            "frame": "hand",
         },
         motion={"target": [0.0, 0.0, 0.1], "drive": "force"},
     )
     linear = {name: effect for name, effect in EFFECTS.items() if name not in ("finite_strain", "obstacles")}
     assert all(effect.active(full) for effect in linear.values())
     counts = {name: len(effect.operators(full)) for name, effect in linear.items()}
-    assert counts == {"gravity": 0, "damping": 0, "reaction": 2, "rotation": 3, "layers": 3}
+    assert counts == {"gravity": 0, "damping": 0, "reaction": 2, "rotation": 3, "frame": 1, "layers": 3}
     assert all(effect.term and effect.cost for effect in EFFECTS.values())
 
 

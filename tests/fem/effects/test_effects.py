@@ -194,7 +194,7 @@ def test_damping_takes_energy_and_says_how_much(comm: MPI.Intracomm, effects: di
     rng = np.random.default_rng(2)
     z, v = rng.standard_normal((2, model.system.layout.n_e))
     run = run_from(model, 0.1 * z, v)
-    work, lost = run.balance()
+    work, lost = run.ledger.balance(run.reached)
     after = run.midpoint.energy(run.state)
     K, M = (gather_matrix(model.system.layout, A) for A in (model.system.K_ee, model.system.M_ee))
     before = (0.01 * z @ (K @ z) + v @ (M @ v)) / 2

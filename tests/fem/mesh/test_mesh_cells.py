@@ -15,7 +15,7 @@ import skfem
 from skfem.helpers import ddot, div, sym_grad
 
 from softgrasp.fem.errors import MeshError, SceneError
-from softgrasp.fem.mesh.cells import check_straight, cut_cells, shape_of, simplices
+from softgrasp.fem.mesh.cells import LITTLE, check_straight, cut_cells, shape_of, simplices, volume_of_curves
 from softgrasp.fem.mesh.check import find_parts, signed_volumes, sort_facets
 from softgrasp.fem.mesh.file import load_arrays, read_mesh
 from softgrasp.fem.model.build import build
@@ -164,9 +164,61 @@ def test_straight_cells_of_higher_order_are_their_corners(mpi_tmp_path: Path, ki
     assert np.array_equal(arrays.cells, cells)
     assert np.array_equal(arrays.points, points)
     assert volume(read_mesh(COMM, path)) == pytest.approx(2.0, rel=WIDE)
-    more[high[4, dimension + 1]] += np.array([0.02, -0.01, 0.03])[:dimension]  # along no edge of the grid
+    more[high[4, dimension + 1]] += np.array([0.08, -0.05, 0.06])[:dimension]  # along no edge of the grid
     with pytest.raises(MeshError, match=rf"1 curved cell of type {kind}.*lies 0\.0\d+ m off"):
         read_mesh(COMM, save(mpi_tmp_path / f"b{suffix}", more, [(kind, high)]))
+
+
+def round_body(dimension: int, fine: int) -> tuple[np.ndarray, np.ndarray]:
+    """Second-order cells of the unit disc or ball: a fan from the centre, all nodes of the surface on it."""
+    if dimension == 2:
+        angle = 2 * np.pi * np.arange(fine) / fine
+        surface, facets = np.c_[np.cos(angle), np.sin(angle)], np.c_[np.arange(fine), (np.arange(fine) + 1) % fine]
+    else:
+        surface = np.vstack([np.eye(3), -np.eye(3)])
+        facets = np.array([[a, b, c] for a in (0, 3) for b in (1, 4) for c in (2, 5)])
+        for _ in range(fine):
+            middles = [(facets[:, i], facets[:, (i + 1) % 3]) for i in range(3)]
+            new = [len(surface) + k * len(facets) + np.arange(len(facets)) for k in range(3)]
+            surface = np.vstack([surface, *((surface[a] + surface[b]) / 2 for a, b in middles)])
+            corners = [np.c_[facets[:, i], new[i], new[i - 1]] for i in range(3)]
+            facets = np.vstack([*corners, np.stack(new, 1)])
+        surface /= np.linalg.norm(surface, axis=1)[:, None]
+        surface, same = np.unique(surface.round(12), axis=0, return_inverse=True)
+        facets = same.reshape(-1)[facets]
+    points, cells = np.vstack([0 * surface[:1], surface]), np.c_[np.zeros(len(facets), dtype=int), facets + 1]
+    flip = np.linalg.det(points[cells][:, 1:] - points[cells][:, :1]) < 0
+    cells[flip, -2:] = cells[flip, :-3:-1]
+    more, high = raised(cells, points, 2)
+    outside = np.linalg.norm(more[high], axis=2) > 0.75
+    rim = np.unique(high[outside])
+    more[rim] /= np.linalg.norm(more[rim], axis=1)[:, None]
+    return more, high
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(("dimension", "fine", "exact"), [(2, 32, np.pi), (3, 3, 4 * np.pi / 3)])
+def test_slightly_curved_cells_are_straightened_and_the_change_is_told(
+    tmp_path: Path, dimension: int, fine: int, exact: float
+) -> None:
+    """The parabolas have the volume of disc and ball but for the fourth order of the angle of a cell."""
+    kind = "triangle6" if dimension == 2 else "tetra10"
+    points, cells = round_body(dimension, fine)
+    corner = points[cells[:, : dimension + 1]]
+    straight = np.linalg.det(corner[:, 1:] - corner[:, :1]).sum() / (2 if dimension == 2 else 6)
+    edges = list(combinations(range(dimension + 1), 2))
+    change = volume_of_curves(points, cells, edges)
+    assert change == pytest.approx(exact / straight - 1, rel=0.03)  # fourth order, 0.1 to 0.2 radian
+    path = save(tmp_path / "round.vtu", points, [(kind, cells)])
+    if change > LITTLE[1]:
+        with pytest.raises(
+            MeshError, match=rf"straight cells would change its volume by {-100 * change / (1 + change):.2f} %: export"
+        ):
+            load_arrays(path, 1.0, False)
+        return
+    (note,) = load_arrays(path, 1.0, False).known["notes"]
+    assert f"{fine} curved cells of type {kind}" in note
+    assert f"changes the volume of the body by {100 * (straight / exact - 1):.2f} %" in note
 
 
 @pytest.mark.serial

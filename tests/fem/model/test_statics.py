@@ -19,7 +19,7 @@ from skfem.helpers import ddot, div, sym_grad
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, structured_mesh
-from softgrasp.fem.model.assembly import Inventory, _bilinear, assemble, discretise
+from softgrasp.fem.model.assembly import Blocks, Inventory, _bilinear, assemble, discretise
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.scene.scene import Scene
@@ -73,7 +73,7 @@ def test_patch(comm: MPI.Intracomm, size: list[float], cells: list[int], order: 
     """A linear displacement of the boundary gives the linear displacement and its constant stress inside."""
     scene, d = clamped(size, cells, order), len(size)
     space = discretise(bent(structured_mesh(comm, size, cells), size), scene)
-    _, K = tissue_matrices(assemble(space, scene, Inventory()), (LayerMaterial(30.0, 20.0, 2.0),))
+    _, K = tissue_matrices(assemble(space, Blocks(space, scene), Inventory()), (LayerMaterial(30.0, 20.0, 2.0),))
     full = full_stiffness(space.V, 30.0, 20.0)
     A = np.random.default_rng(5).standard_normal((d, d))
     u, f = full.createVecs()
@@ -165,7 +165,7 @@ def test_frequencies_converge_to_exact_ones(comm: MPI.Intracomm, order: int, cel
         size, counts = [a, b], [n, 3 * n // 5]
         scene = clamped(size, counts, order)
         space = discretise(structured_mesh(comm, size, counts), scene)
-        M, K = tissue_matrices(assemble(space, scene, Inventory()), (LayerMaterial(-mu, mu, rho),))
+        M, K = tissue_matrices(assemble(space, Blocks(space, scene), Inventory()), (LayerMaterial(-mu, mu, rho),))
         errors.append(np.sqrt(lowest(K, M, space.layout, 10)) - exact)
     assert (np.array(errors) > 0).all()  # Rayleigh quotients in a subspace are never below
     rates = -np.polyfit(np.log(cells[1:]), np.log(errors[1:]), 1)[0]

@@ -266,7 +266,18 @@ REFUSED = [
     ([ON], "obstacle is missing; effects.obstacles needs at least one [[obstacle]]"),
     ([TABLE], "set effects.obstacles = true for contact"),
     ([TABLE, ON, "time.solver='cg'"], "effects.obstacles needs a factor"),
-    ([TABLE, ON, "effects.finite_strain={}"], "effects.obstacles cannot go with effects.finite_strain"),
+    (
+        [TABLE, ON, "effects.finite_strain={}", "effects.reaction=true"],
+        "effects.reaction cannot go with effects.obstacles",
+    ),
+    (
+        [TABLE, ON, "effects.finite_strain={}", "effects.gravity={g=[0, -1]}", "time.start='equilibrium'"],
+        "starts at 'rest'",
+    ),
+    (
+        [TABLE.replace("}]", ", friction=0.1}]"), ON, "effects.finite_strain={}"],
+        "friction, which effects.finite_strain",
+    ),
     ([TABLE, ON, "tissue.refine={tolerance=0.1}"], "tissue.refine.tolerance cannot go with effects.obstacles"),
 ]
 

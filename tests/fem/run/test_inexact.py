@@ -41,7 +41,7 @@ def apart(run: Trajectory, other: Trajectory) -> float:
     return float(np.abs(run.outputs - other.outputs).max() / deformation)
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 @pytest.mark.parametrize(("name", "solver"), [*((name, "stars") for name in CASES), ("pushed", "cg")])
 def test_energy_is_exact_at_any_tolerance(comm: MPI.Intracomm, name: str, solver: str) -> None:
     """The momentum with r in place of S w, or a guess without scaling, leaves 1e-8 to 1e-6."""
@@ -116,7 +116,7 @@ def test_guess_is_the_best_in_the_span(comm: MPI.Intracomm) -> None:
     assert np.abs(past.guess(r[mine]) - best[mine]).max() < 1e-9 * np.abs(best).max()  # condition of S about 1e2
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 @pytest.mark.parametrize("name", ["damped", "pushed"])
 def test_restart_goes_on_as_the_whole_run(comm: MPI.Intracomm, mpi_tmp_path: Path, name: str) -> None:
     changes: Any = [*SILICONE, *FEW, *CASES[name], "time.solver=stars"]

@@ -115,7 +115,7 @@ def test_energy_does_not_depend_on_the_ranks(comm: MPI.Intracomm, name: str) -> 
         ts = make_ts(run)
         run.start()
         run.advance_to(ts, 20)
-        found.append(np.array([run.midpoint.energy(run.state), *run.balance()]))
+        found.append(np.array([run.midpoint.energy(run.state), *run.ledger.balance(run.reached)]))
     together, alone = found
     assert abs(together - alone).max() < SAME * abs(alone).max()
 

@@ -1,0 +1,79 @@
+"""The books of a run's energy: what loads, contact and damping did in each step, and whether it explains the energy."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
+
+if TYPE_CHECKING:
+    from softgrasp.fem.run.contact.general import Contact
+
+
+class Ledger:
+    """E_n = E_0 + work of loads, sum 2 c'G'w, and of contact - energy dissipated, as the midpoint rule keeps it.
+
+    Args:
+        midpoint: step of the tissue, after the drive of the hand was made.
+        loads: coefficients c of the load G c of each step, (steps, n_s); written by others.
+        contact: contact with obstacles, or None.
+
+    Attributes:
+        pulls: products G'w of each step on the rows here, (steps + 1, n_s or 2 n_s).
+        taken: energy dissipated on the rows here, and work of contact, up to each time [J]; None where both are zero.
+        first: energy at the start [J].
+        peak: largest energy that was sampled [J].
+    """
+
+    def __init__(self, midpoint: TissueMidpoint, loads: Array, contact: Contact | None = None) -> None:
+        self.midpoint, self.loads, self.contact = midpoint, loads, contact
+        rows = len(loads) + 1
+        self.pulls = np.zeros((rows, len(midpoint.pull())))
+        counts = midpoint.system.damping.active or contact is not None
+        self.taken = np.zeros((rows, 2)) if counts else None
+        self.first = self.peak = 0.0
+
+    def record(self, n: int) -> None:
+        """Enter the step that ends at n."""
+        self.pulls[n] = self.midpoint.pull()
+        if self.taken is not None:
+            self.taken[n, 0] = self.midpoint.dissipated
+            if self.contact is not None:
+                self.taken[n, 1] = self.contact.table.energy[0]
+
+    def start(self, state: TissueState) -> None:
+        """Take the energy of the first state. Collective."""
+        self.first = self.midpoint.energy(state)
+        self.peak = abs(self.first)
+
+    def sample(self, state: TissueState) -> float:
+        """Energy of a state, for the scale of the drift [J]. Collective."""
+        energy = self.midpoint.energy(state)
+        self.peak = max(self.peak, abs(energy))
+        return energy
+
+    def balance(self, n: int) -> tuple[float, float]:
+        """Work of loads and contact, and energy dissipated, from the start to step n, the last [J]. Collective."""
+        work = self.midpoint.work(self.loads[:n], self.pulls[1 : n + 1])
+        contact = 0.0 if self.contact is None else float(self.contact.table.energy[0])
+        return self.midpoint.over_ranks(work) + contact, self.midpoint.over_ranks(self.midpoint.dissipated)
+
+    def drift(self, state: TissueState, n: int) -> float:
+        """Energy at step n that neither load nor damping explains, over the largest energy seen. Collective."""
+        work, lost = self.balance(n)
+        defect = self.midpoint.energy(state) - self.first - work + lost
+        scale = max(self.peak, abs(work), abs(lost))
+        return abs(defect) / scale if scale > 0 else 0.0
+
+    def over_time(self) -> tuple[Array, Array]:
+        """Energy, and energy dissipated so far, at each time, (steps + 1,) [J]. Collective."""
+        shares, contact = np.zeros((2, len(self.pulls))), np.zeros(len(self.pulls))
+        np.cumsum(self.midpoint.works(self.loads, self.pulls[1:]), out=shares[0, 1:])
+        if self.taken is not None:
+            shares[1], contact = self.taken.T
+        if not self.midpoint.operators.whole:
+            shares = total(self.midpoint.system.layout.comm, shares)
+        return self.first + shares[0] + contact - shares[1], shares[1]
