@@ -7,6 +7,7 @@ from softgrasp.fem import _stack as _stack  # threads and MPI before numpy and p
 
 if TYPE_CHECKING:
     from softgrasp.lqr.constrained.plan import Plan, quadratic_program
+    from softgrasp.lqr.constrained.separation import separate
     from softgrasp.lqr.dense.care import solve_reduced
     from softgrasp.lqr.design.constrained import PlannedControl, plan_control
     from softgrasp.lqr.design.controller import CertifiedController
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from softgrasp.lqr.design.linearise import finite_problem, linearised
     from softgrasp.lqr.design.orders import BasisGains, Notify
     from softgrasp.lqr.design.scene import control_of, with_control
+    from softgrasp.lqr.loop.controller import load_gain
     from softgrasp.lqr.loop.full import LoopTrajectory
     from softgrasp.lqr.loop.margins import LoopMargins
     from softgrasp.lqr.plant.checks import ControlError

@@ -17,10 +17,10 @@ from softgrasp.fem.obstacles.shapes import HalfSpace, Shape
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.resources import free_memory, size_text
 from softgrasp.lqr.constrained.horizon import HeldPlant, Horizon
-from softgrasp.lqr.constrained.least_distance import InfeasibleError, nearest, nearest_soft
 from softgrasp.lqr.constrained.rows import Limits, bends, both_ends, broken, follow, gap_rows, limit_rows, tail_level
 from softgrasp.lqr.constrained.separation import past, separate, supports
 from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.program.least_distance import InfeasibleError, nearest, nearest_soft
 
 ROUNDS = 20  # of half-planes; four to eight are usual
 SETTLED = 2e-4  # of the cost of obstacles, between two rounds

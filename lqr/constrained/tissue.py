@@ -33,6 +33,7 @@ class ModalTissue:
     g: Array  # coupling to the hand, (k, n_s)
     seen: Array  # S, displacement of the nodes in each mode, (nodes, d, k)
     c: Array  # outputs of the modes, (p, k)
+    of: Array | None = None  # of a reduced one, its shapes by the modes of the full one, (n, k)
 
     @property
     def delta(self) -> Array:
@@ -52,7 +53,7 @@ class ModalTissue:
         shapes = static_and_modes(self.omega, self.delta, self.g, self.c, k)
         squares, T = np.linalg.eigh(shapes.T @ (self.omega[:, None] ** 2 * shapes))
         V = shapes @ T
-        return ModalTissue(np.sqrt(squares), self.alpha, self.beta, V.T @ self.g, self.seen @ V, self.c @ V)
+        return ModalTissue(np.sqrt(squares), self.alpha, self.beta, V.T @ self.g, self.seen @ V, self.c @ V, V)
 
     def answer(self, a: Array, grid: float, parts: int) -> Array:
         """Amplitudes eta at the instants of all intervals under accelerations held from rest, (H, parts + 1, k).
@@ -119,21 +120,26 @@ def make_surface(layout: BlockLayout, free: np.ndarray, held: np.ndarray) -> Sur
     return Surface(rows, sum(counts[: comm.rank]), sum(counts), nodes)
 
 
-def modal_tissue(problem: RiccatiProblem, surface: Surface) -> ModalTissue:
-    """All modes of the tissue of a plant. Collective.
+def modal_tissue(problem: RiccatiProblem, surface: Surface, loop: ModalLoop | None = None) -> ModalTissue:
+    """All modes of the tissue of a plant, of ``loop`` where they are known. Collective.
 
     Raises ControlError: the hand hears the tissue, the damping couples modes or drags in space, or there are too many
     unknowns.
     """
     system, layout = problem.system, problem.layout
     d = layout.dimension
-    reason = _not_planned(problem)
-    if reason:
-        raise ControlError(f"a plan past obstacles is made for {reason}")
-    plant = ModalLoop(problem, DENSE_LIMIT).plant
+    require_plannable(problem)
+    plant = (loop or ModalLoop(problem, DENSE_LIMIT)).plant
     seen = np.zeros((len(surface.nodes), d, len(plant.omega)))
     seen[: surface.free] = rows_on_all(layout.comm, plant.Phi[surface.rows])
     return ModalTissue(plant.omega, system.damping.alpha, system.damping.beta, plant.g, seen, plant.c)
+
+
+def require_plannable(problem: RiccatiProblem) -> None:
+    """Raises ControlError: the plant has no plan, whatever its gain."""
+    reason = _not_planned(problem)
+    if reason:
+        raise ControlError(f"a plan past obstacles is made for {reason}")
 
 
 def _not_planned(problem: RiccatiProblem) -> str:

@@ -10,30 +10,37 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
+from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.obstacles import Obstacle, make_obstacles
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.constrained.horizon import held_plant
+from softgrasp.lqr.constrained.online import Ticks, carried_ticks, make_program
 from softgrasp.lqr.constrained.plan import Plan, Task, make_plan
 from softgrasp.lqr.constrained.pulse import PulseError
 from softgrasp.lqr.constrained.rows import Limits
 from softgrasp.lqr.constrained.run import STEPS, PlanRuns, run_inputs, run_plan
 from softgrasp.lqr.constrained.separation import separate
-from softgrasp.lqr.constrained.tissue import ModalTissue, Surface, make_surface, modal_tissue
+from softgrasp.lqr.constrained.tissue import ModalTissue, Surface, make_surface, modal_tissue, require_plannable
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.linearise import finite_problem
 from softgrasp.lqr.design.scene import control_of, problem
+from softgrasp.lqr.loop.controller import Controller, layout_hash
+from softgrasp.lqr.loop.small import galerkin
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import rest
+from softgrasp.lqr.program.replan import Replanned
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
+from softgrasp.lqr.spectrum.sampled import Sampling
 
 if TYPE_CHECKING:  # observers are not imported where a scene has none
     from softgrasp.lqr.design.observer import ObservedControl
-    from softgrasp.lqr.observer.tube import Tube
 
 FINITE_STEPS = 5  # of a run of finite strain in each part of an interval: 25 ms at the defaults
 SETTLED = 5.0  # time constants of the hand alone that the first horizon lasts: 0.7 % of the way are left
 AT_REST = 1e-9  # of the body: a start so near to equilibrium is one
+SWINGS = "a plan starts with the tissue in equilibrium; set time.start = 'equilibrium'"
 
 
 @dataclass(frozen=True)
@@ -48,8 +55,10 @@ class PlannedControl:
     """Nodes of the body on its boundary."""
     names: tuple[str, ...]
     """Of the obstacles."""
-    tube: PlannedTube | None = None
-    """Feedback around the plan with noise; None where the scene has no observer."""
+    online: PlannedOnline | None = None
+    """The controller that plans again at every interval, on the full plant; None where there is none."""
+    reason: str = ""
+    """Why there is no such controller; empty where there is one."""
 
 
 @dataclass(frozen=True)
@@ -64,17 +73,22 @@ class PlanSizes:
 
 
 @dataclass(frozen=True)
-class PlannedTube:
-    """A plan with feedback from samples around it, under noise and disturbances."""
+class PlannedOnline:
+    """The controller that follows a plan and makes it again at every interval, on the full plant from tick to tick.
 
-    tube: Tube
+    With an observer under noise and disturbances, else without and with as many ticks as the run of the plan has steps.
+    """
+
+    controller: Controller
     """What a robot runs."""
-    covariance: Array
-    """Of the place of every node around its way [m2], (nodes, d, d)."""
+    covariance: Array | None
+    """Of the place of every node around its way [m2], (nodes, d, d); None without an observer."""
     times: Array
-    """Instants of the noisy run that are kept [s], (count,)."""
+    """Instants of the run that are kept [s], (count,)."""
     gaps: Array
-    """Distance of body and obstacle in that run, negative where they overlap [m], (count, obstacles)."""
+    """Distance of body and obstacle in it, negative where they overlap [m], (count, obstacles)."""
+    log: tuple[Replanned, ...]
+    """How every interval began."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +126,8 @@ def plan_control(
     watch: Stopwatch,
     notify: Callable[[int, int], None] | None = None,
     observed: ObservedControl | None = None,
+    online: bool = True,
+    estimated: float = 0.0,
 ) -> PlannedControl:
     """Plan past the obstacles of a scene, within its limits, and run it on the full plant. Collective.
 
@@ -120,6 +136,8 @@ def plan_control(
         watch: records the seconds of "bound", "plan" and "plan run".
         notify: called with the number of steps of the full plant done and in all.
         observed: the observer of the scene, whose feedback keeps the plant near to the plan.
+        online: whether the controller that plans again is made and run.
+        estimated: further margin, for what the linear plant errs [m].
 
     Raises:
         ControlError: the plant has no plan, the target keeps no gap or limit, or a key is missing.
@@ -132,7 +150,9 @@ def plan_control(
     surface = _surface(design.model)
     start = _at_rest(design)
     with watch.stage("bound"):
-        tissue = modal_tissue(plant, surface)
+        require_plannable(plant)
+        loop = ModalLoop(plant, DENSE_LIMIT) if observed is None else observed.loop
+        tissue = modal_tissue(plant, surface, loop)
         reduced = tissue.reduced(given.N // 2 - plant.layout.n_s)
         limits = _limits(design)
         error = np.full(surface.nodes.shape, 0.0 if given.margin == "bound" else given.margin)
@@ -149,7 +169,7 @@ def plan_control(
         penalty = None if given.penalty == "auto" else float(given.penalty)
         target = _places(plant, surface, design)
         task = Task(
-            begin, target, design.target.u, shapes, names, error, given.clearance, limits, noise,
+            begin, target, design.target.u, shapes, names, error, given.clearance + estimated, limits, noise,
             given.margin == "bound", penalty,
         )  # fmt: skip
         steps = first_horizon(design.model, plant)
@@ -157,11 +177,11 @@ def plan_control(
         plan = on_root(plant.layout.comm, lambda: make_plan(on_grid, task, steps, longest))
     with watch.stage("plan run"):
         runs = run_plan(plant, design.solution, plan, surface, tissue, design.start, design.target, notify)
-    tube = None
-    if observed is not None:
-        with watch.stage("tube"):
-            tube = on_root(plant.layout.comm, lambda: _tube(plan, observed, tissue))
-    return PlannedControl(plan, runs, surface, names, tube)
+    if not online:
+        return PlannedControl(plan, runs, surface, names)
+    with watch.stage("online"):
+        robot, reason = _online(design, plan, tissue, loop, observed)
+    return PlannedControl(plan, runs, surface, names, robot, reason)
 
 
 def _noise(
@@ -189,16 +209,102 @@ def _noise(
     return deviations * sd, limits
 
 
-def _tube(plan: Plan, observed: ObservedControl, tissue: ModalTissue) -> PlannedTube:
-    """The plan on the full plant with noise, and what noise does around any plan. Not collective."""
-    from softgrasp.lqr.observer.tube import make_tube, node_covariance, node_rows, run_tube
+def planned_controller(
+    design: Design,
+    plan: Plan,
+    modes: ModalLoop,
+    observed: ObservedControl | None = None,
+    rate: float | None = None,
+) -> Controller:
+    """The controller that follows a plan and makes it again at every interval, from the observer's estimate or its own.
 
-    plant, judged = plan.horizon.plant, observed.judged
-    tube, rows = make_tube(plan, observed.controller), node_rows(tissue, plant.n_s)
-    every = max(1, tube.each // (plant.parts * STEPS))
-    run = run_tube(tube, observed.ticks, rows, len(plan.inputs) * tube.each, every)
-    gaps = [[separate(shape, plan.task.places + moved)[1] for shape in plan.task.shapes] for moved in run.moved]
-    return PlannedTube(tube, node_covariance(rows, judged), run.times, np.array(gaps).reshape(len(run.times), -1))
+    Collective.
+
+    Args:
+        design: the optimal feedback, which keeps the plant near to the plan.
+        modes: all modes of the plant.
+        observed: observer of the scene; None: the tissue is carried from the measured hand.
+        rate: ticks a second without an observer; None: those of the scene.
+
+    Raises ControlError: the plan does not keep everything, an interval is no multiple of the tick, or the loop is not
+    stable.
+    """
+    problem, n_s = design.problem, design.problem.layout.n_s
+    own = plan.horizon.plant.tissue.of
+    assert own is not None
+    if observed is None:
+        plant, shapes = galerkin(problem, modes.plant.Phi @ own)
+        x_bar, u_bar = plant.rest_at(design.target.state.q_s)
+        period = 1 / (rate or control_of(design.model).loop.rate)
+        base = Controller(
+            shapes.reduce_gain(problem, design.gain), x_bar, u_bar, plant, period,
+            None, scene_hash(design.model.scene), layout_hash(problem.layout),
+            {"scene": design.model.scene.name, "method": "optimal gain around a plan", "N": plant.N},
+        )  # fmt: skip
+        radius = design.gain_check.ticks.controller(base, Sampling(base.period, 1))
+        if not radius.value < 1:
+            raise ControlError(f"the loop from tick to tick is not stable, its spectral radius is {radius.value:.3g}")
+        mixed, ticks = own, carried_ticks(base)
+    else:
+        base, filter_ = observed.controller, observed.reduced.filter
+        mixed, ticks = observed.reduced.mixed, Ticks(filter_.A, filter_.B, filter_.f)
+    eta = own.T @ mixed  # from the tissue of the controller to that of the plan
+    T = scipy.linalg.block_diag(np.eye(2 * n_s), eta, eta)
+    force, loop = _given_force(design.model, n_s), design.actuation.bound(n_s)
+    limits = loop if force is None else force if loop is None else np.minimum(force, loop)
+    program = make_program(plan, T, base.x_bar, ticks, base.period)
+    return replace(base, limits=limits, planner=program)
+
+
+def _online(
+    design: Design, plan: Plan, tissue: ModalTissue, modes: ModalLoop, observed: ObservedControl | None
+) -> tuple[PlannedOnline | None, str]:
+    """The planned controller on the full plant for the horizon, or why there is none. Collective."""
+    from softgrasp.lqr.observer.judge import make_ticks
+    from softgrasp.lqr.observer.sensors import Noise, make_disturbance, make_sensors
+    from softgrasp.lqr.observer.tube import node_covariance, node_rows, run_tube
+
+    problem = design.problem
+    try:
+        controller = planned_controller(design, plan, modes, observed)
+    except ControlError as error:
+        return None, str(error)
+    runs = controller
+    if observed is None:
+        slow = (
+            plan.horizon.plant.parts * STEPS / plan.horizon.plant.grid
+        )  # ticks a second: between them nothing happens
+        if slow < 1 / controller.period:
+            runs = planned_controller(design, plan, modes, rate=slow)
+        sensors, nothing = make_sensors(problem, [], Noise(0.0, 0.0)), make_disturbance(problem, 0.0, 0.0, None)
+        ticks = make_ticks(problem, modes, sensors, nothing, runs.period)
+    else:
+        ticks = observed.ticks
+
+    def run() -> PlannedOnline:
+        plant, program = plan.horizon.plant, runs.planner
+        assert program is not None
+        rows = node_rows(tissue, plant.n_s)
+        every = max(1, program.every // (plant.parts * STEPS))
+        count = plan.horizon.steps * program.every
+        found = run_tube(runs, ticks, rows, count, every, None if observed is None else 0)
+        gaps = [[separate(shape, plan.task.places + moved)[1] for shape in plan.task.shapes] for moved in found.moved]
+        covariance = None if observed is None else node_covariance(rows, observed.judged)
+        return PlannedOnline(
+            controller, covariance, found.times, np.array(gaps).reshape(len(found.times), -1), found.log
+        )
+
+    return on_root(problem.layout.comm, run), ""
+
+
+def require_plan(model: Model) -> None:
+    """Raises ControlError: the scene has no plan, whatever its gain. Collective."""
+    fixed_obstacles(model)
+    plant = problem(model)
+    require_plannable(plant)
+    _given_force(model, plant.layout.n_s)
+    if model.system.gravity is not None and model.scene.time.start != "equilibrium":
+        raise ControlError(SWINGS)
 
 
 def fixed_obstacles(model: Model) -> tuple[Obstacle, ...]:
@@ -247,13 +353,27 @@ def _at_rest(design: Design) -> Array:
     off, layout = design.start - design.target.state, design.problem.layout
     swing = float(total(layout.comm, np.array([off.z @ off.z + off.v_z @ off.v_z]))[0]) ** 0.5
     if swing > AT_REST * layout.extent or off.v_s.any():
-        raise ControlError("a plan starts with the tissue in equilibrium; set time.start = 'equilibrium'")
+        raise ControlError(SWINGS)
     return off.q_s
 
 
 def _limits(design: Design) -> Limits:
     """Of the scene, one number per axis. Raises ControlError: their number does not fit, or the loop cuts them."""
     given, n_s = control_of(design.model).constraints, design.problem.layout.n_s
+    assert given is not None
+    force = _given_force(design.model, n_s)
+    bound = design.actuation.bound(n_s)
+    if bound is not None and (force is None or (force > bound).any()):
+        raise ControlError(
+            f"control.loop.limit cuts the forces at {bound.min():.4g} N, and a plan needs all of its own; set "
+            "control.constraints.force to no more than that"
+        )
+    return Limits(force, given.speed, given.jump)
+
+
+def _given_force(model: Model, n_s: int) -> Array | None:
+    """Largest force on the hand of the scene, one number per axis. Raises ControlError: their number does not fit."""
+    given = control_of(model).constraints
     assert given is not None
     if given.force is None and given.margin == "bound":
         raise ControlError(
@@ -263,13 +383,7 @@ def _limits(design: Design) -> Limits:
     force = None if given.force is None else np.atleast_1d(np.asarray(given.force, dtype=np.float64))
     if force is not None and len(force) not in (1, n_s):
         raise ControlError(f"control.constraints.force has {len(force)} numbers; give one, or {n_s}, one per axis")
-    bound = design.actuation.bound(n_s)
-    if bound is not None and (force is None or (force > bound).any()):
-        raise ControlError(
-            f"control.loop.limit cuts the forces at {bound.min():.4g} N, and a plan needs all of its own; set "
-            "control.constraints.force to no more than that"
-        )
-    return Limits(None if force is None else np.broadcast_to(force, (n_s,)).copy(), given.speed, given.jump)
+    return None if force is None else np.broadcast_to(force, (n_s,)).copy()
 
 
 def _force(limits: Limits) -> Array:

@@ -50,6 +50,7 @@ def problem(model: Model) -> RiccatiProblem:
     """
     model = checked_model(model)
     model.scene.refuse_contact("control")
+    model.scene.refuse_frame("control")
     scene, system = model.scene, model.system
     outputs = make_outputs(scene, system)
     C_z = output_columns(outputs, system.layout.n_local)

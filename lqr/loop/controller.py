@@ -23,6 +23,7 @@ from softgrasp.lqr.plant.gain import Gain, PlantState
 
 if TYPE_CHECKING:
     from softgrasp.lqr.loop.filter import Filter
+    from softgrasp.lqr.program.program import Program
 
 FORMAT = 1
 PLANT = ("E", "A", "B", "C", "f", "S_q", "S_v")  # arrays of the reduced plant in a file
@@ -91,6 +92,8 @@ class Controller(Shown):
     """Method, weights and output names, as free text."""
     observer: Filter | None = None
     """Kalman filter of the reduced plant at the period; None where nothing but the hand is measured."""
+    planner: Program | None = None
+    """Plan past obstacles and its quadratic program, solved again at every interval; None where there is no plan."""
 
     def card(self) -> Card:
         """Dimension, rate, limits and target."""
@@ -120,6 +123,8 @@ class Controller(Shown):
         self._upper = -self._lower
         if self.observer is not None and self.observer.B.shape != (N, n_s):
             raise ControlError(f"the observer has {len(self.observer.A)} states, the plant of the controller {N}")
+        if self.planner is not None and self.planner.T.shape[1] != N:
+            raise ControlError(f"the plan takes {self.planner.T.shape[1]} states, the plant of the controller has {N}")
         self.model = _tissue_step(self.plant, self.period)
         self.reset()
 
@@ -134,11 +139,19 @@ class Controller(Shown):
         self._x = np.zeros(self.plant.N)
         self._x[2 * n_s :] = self.plant.rest_at(np.zeros(n_s))[0][2 * n_s :] if tissue is None else tissue
         self._fresh = True
+        if self.planner is not None:
+            from softgrasp.lqr.program.replan import Replanner  # of controllers with a plan
+
+            self.replanner = Replanner(self.planner, self.K, self.x_bar, self.u_bar)
 
     def command(self, x: Array) -> Array:
         """Load for a known reduced state x (N,) [N, N m], (n_s,)."""
         u = self.K @ x
         u += self._offset
+        return self._within(u)
+
+    def _within(self, u: Array) -> Array:
+        """The load within its limits."""
         return np.minimum(np.maximum(u, self._lower), self._upper)
 
     def step(self, q_s: Array, v_s: Array, y: Array | None = None) -> Array:
@@ -164,7 +177,11 @@ class Controller(Shown):
             x[2 * n_s :] = tissue + constant
         self._fresh = False
         x[:n_s], x[n_s : 2 * n_s] = q_s, v_s
-        return self.command(x)
+        return self._load(x)
+
+    def _load(self, x: Array) -> Array:
+        """Load of a tick for the state x, of the plan where there is one."""
+        return self.command(x) if self.planner is None else self._within(self.replanner.command(x.copy()))
 
     def _observed(self, q_s: Array, v_s: Array, y: Array | None) -> Array:
         """One tick with an observer."""
@@ -175,7 +192,7 @@ class Controller(Shown):
             self._x[: self.n_s], self._x[self.n_s : 2 * self.n_s] = q_s, v_s
             self._estimate, self._fresh = Estimate(self.observer, self._x.copy()), False
         self._x = self._estimate.correct(q_s, v_s, y)
-        u = self.command(self._x)
+        u = self._load(self._x)
         self._estimate.apply(u)
         return u
 
@@ -185,12 +202,21 @@ class Controller(Shown):
         return self._x[2 * self.n_s :].copy()
 
     def towards(self, q_bar: Array) -> Controller:
-        """The same gain with another target of the hand. Raises ControlError: the plant has no state of rest there."""
+        """The same gain with another target of the hand.
+
+        Raises ControlError: the plant has no state of rest there, or the controller follows a plan.
+        """
+        if self.planner is not None:
+            raise ControlError("this controller follows a plan to its own target; make another plan for another target")
         x_bar, u_bar = self.plant.rest_at(q_bar)
         return replace(self, x_bar=x_bar, u_bar=u_bar)
 
     def save(self, path: str | Path) -> Path:
-        """Write everything into one .npz file. Not collective: call it on one rank.
+        """Write everything into one .npz file, which NumPy alone reads. Not collective: call it on one rank.
+
+        Arrays: ``K`` (n_s, N), ``x_bar`` (N,), ``u_bar`` (n_s,), the plant's matrices as ``plant_E``, ``plant_A`` and
+        so on, ``limits`` (n_s,) where there are any, ``observer_...`` and ``plan_...`` with an observer or a plan. The
+        text ``meta`` is JSON: format, names of the outputs, period [s], hashes of scene and mesh, origin.
 
         Raises ControlError: the file cannot be written.
         """
@@ -203,6 +229,8 @@ class Controller(Shown):
         if self.observer is not None:
             arrays |= {f"observer_{key}": getattr(self.observer, key) for key in FILTER}
             meta["observer"] = {key: getattr(self.observer, key) for key in ("names", "speed", "delay")}
+        if self.planner is not None:
+            arrays |= {f"plan_{key}": np.asarray(value) for key, value in self.planner.arrays().items()}
         return write_npz(Path(path), meta, arrays)
 
     @classmethod
@@ -217,7 +245,7 @@ class Controller(Shown):
         try:
             plant = ReducedSystem(**{key: arrays[f"plant_{key}"] for key in PLANT}, names=tuple(meta["names"]))
             about = {key: meta[key] for key in ("period", "scene_hash", "layout_hash", "about")}
-            about |= {"limits": arrays.get("limits"), "observer": _filter(meta, arrays)}
+            about |= {"limits": arrays.get("limits"), "observer": _filter(meta, arrays), "planner": _planner(arrays)}
             return cls(arrays["K"], arrays["x_bar"], arrays["u_bar"], plant, **about)
         except KeyError as error:
             raise ControlError(f"{path} has no controller ({error} is missing); save it again") from error
@@ -232,6 +260,15 @@ def _filter(meta: dict[str, Any], arrays: dict[str, Array]) -> Filter | None:
     A, B, f, C, M = (arrays[f"observer_{key}"] for key in FILTER)
     names, speed, delay = (meta["observer"][key] for key in ("names", "speed", "delay"))
     return Filter(A, B, f, C, M, tuple(names), speed, delay)
+
+
+def _planner(arrays: dict[str, Array]) -> Program | None:
+    """The plan of a file; None where it has none. Raises KeyError: an array is missing."""
+    if "plan_F" not in arrays:
+        return None
+    from softgrasp.lqr.program.program import Program
+
+    return Program.of({key.removeprefix("plan_"): value for key, value in arrays.items() if key.startswith("plan_")})
 
 
 def _tissue_step(plant: ReducedSystem, period: float) -> tuple[Array, Array, Array | None, Array]:

@@ -16,6 +16,7 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.labelled import FullOrderRun
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.hand import HandStep
+from softgrasp.fem.run.ledger import Ledger
 from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.snapshots import Snapshots, make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
@@ -69,6 +70,10 @@ class LoopTrajectory(Shown, FullOrderRun):
     """C_s q_s, the outputs without deformation [m, rad], (steps + 1, p)."""
     columns: Columns
     """Label and unit of each output, p."""
+    energy: Array
+    """Energy of the tissue relative to the hand at each time, as of a forward run [J], (steps + 1,)."""
+    dissipated: Array
+    """Energy that damping has taken up to each time [J], (steps + 1,)."""
     cost: Array
     """Cost J up to each grid point, (steps + 1,)."""
     final: PlantState
@@ -213,6 +218,8 @@ class LoopRun(Stepped):
         self.paid, self.paid_until = 0.0, 0
         self.midpoint.dissipated = 0.0
         self.midpoint.start(self.state)
+        self.ledger = Ledger(self.midpoint, np.zeros((steps, problem.layout.n_s)))  # two microseconds a step
+        self.ledger.start(self.state)
         self.record(0)
 
     def solve_step(self, n: int) -> None:
@@ -220,9 +227,12 @@ class LoopRun(Stepped):
         self.drive.solve(n, self.state)
 
     def record(self, n: int) -> None:
-        """Keep the entries of z that this rank gives to the outputs."""
+        """Keep the entries of z that this rank gives to the outputs, and its share of work and loss."""
         if len(self.rows):
             self.seen[n] = self.state.array[self.rows]
+        if n:
+            self.ledger.loads[n - 1] = self.midpoint.c
+            self.ledger.record(n)
 
     def execute(self) -> None:
         """Let TS run to the last step, in segments. Collective.
@@ -295,6 +305,7 @@ class LoopRun(Stepped):
         problem, drive = self.problem, self.drive
         comm, n = problem.layout.comm, problem.layout.n_local
         rigid, outputs = drive.q @ problem.C_s.T, self._outputs(0, self.steps)
+        energy, dissipated = self.ledger.over_time()
         times, array = np.asarray(self.dt * np.arange(self.steps + 1), dtype=np.float64), self.state.array
         return LoopTrajectory(
             times=times,
@@ -304,6 +315,8 @@ class LoopRun(Stepped):
             outputs=outputs,
             outputs_rigid=rigid,
             columns=problem.columns,
+            energy=energy,
+            dissipated=dissipated,
             cost=self._cost(outputs, 0),
             final=PlantState(drive.q[-1].copy(), drive.v[-1].copy(), array[:n].copy(), array[n:].copy()),
             snapshots=self.store.finish(times, drive.q, drive.v),

@@ -1,4 +1,4 @@
-"""A reduced plant on a few shapes of the tissue, with the maps of states and gains from and to the full one."""
+"""A reduced plant on a few shapes of the tissue, with the maps of states and gains to it."""
 
 from __future__ import annotations
 
@@ -30,21 +30,10 @@ class Shapes:
         tissue = total(problem.layout.comm, np.stack([self.W.T @ x.z, self.W.T @ x.v_z]))
         return np.concatenate([x.q_s, x.v_s, tissue.ravel()])
 
-    def expand(self, problem: RiccatiProblem, x: Array) -> PlantState:
-        """The full state of a reduced one."""
-        n_s, k = problem.layout.n_s, self.V.shape[1]
-        q, v, eta, rate = np.split(np.asarray(x), [n_s, 2 * n_s, 2 * n_s + k])
-        return PlantState(q, v, self.V @ eta, self.V @ rate)
-
     def reduce_gain(self, problem: RiccatiProblem, gain: Gain) -> Array:
         """K V = [K_s, K_z'V, K_v'V]: the full gain on states of the form V eta, (n_s, N). Collective."""
         tissue = total(problem.layout.comm, np.stack([gain.K_z.T @ self.V, gain.K_v.T @ self.V]))
         return np.hstack([gain.K_s, tissue[0], tissue[1]])
-
-    def expand_gain(self, problem: RiccatiProblem, K: Array) -> Gain:
-        """The gain on the full state that is u = K [q_s, v_s, W'z, W'v_z]."""
-        n_s, k = problem.layout.n_s, self.V.shape[1]
-        return Gain(K[:, : 2 * n_s], self.W @ K[:, 2 * n_s : 2 * n_s + k].T, self.W @ K[:, 2 * n_s + k :].T)
 
 
 def galerkin(problem: RiccatiProblem, V: Array) -> tuple[ReducedSystem, Shapes]:

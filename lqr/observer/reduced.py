@@ -35,6 +35,7 @@ class ReducedFilter:
     V: Array  # variance of the samples, that of what the shapes leave out included, (p, p)
     left_out: Array  # part of V that the shapes leave out, its diagonal, (p,)
     P: Array  # covariance of the estimate before a sample, by the reduced plant, (N, N)
+    mixed: Array  # shapes by the modes of the tissue, (n, k)
 
 
 def reduced_filter(
@@ -77,7 +78,7 @@ def reduced_filter(
     noise = np.vstack([factor.hand, np.zeros((k, factor.columns)), mixed.T @ loads])
     A, B, f, P, M = on_root(comm, lambda: _stationary(plant, C, noise, V, period))
     own = Filter(A, B, f, C, M, sensors.names, sensors.speed, delay)
-    return ReducedFilter(own, plant, shapes, V, left / period, P)
+    return ReducedFilter(own, plant, shapes, V, left / period, P, mixed)
 
 
 def _stationary(plant: ReducedSystem, C: Array, noise: Array, V: Array, period: float) -> tuple[Array, ...]:

@@ -1,86 +1,26 @@
-"""Feedback around a plan: the plan runs from its own nominal state, the optimal gain keeps the plant near to it.
+"""The full plant from tick to tick under a controller with a plan, with noise and disturbances.
 
-    u = u_nom + K (x^ - x_nom),    x_nom: what the filter's own plant does under u_nom
-
-Noise and disturbances never enter the plan, so that they cannot take its feasibility away: behind the horizon u_nom is
-that of the gain of the grid, which the plan has followed to its safe end. What the plant deviates from its way under
-u_nom has the covariance of the loop with observer, wherever the plan leads.
+What it deviates from its way under u_nom, see :mod:`softgrasp.lqr.program.replan`, has the covariance of the loop with
+observer wherever the plan leads, and less right after a new plan from the estimate.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
 
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.constrained.plan import Plan
 from softgrasp.lqr.constrained.tissue import ModalTissue
 from softgrasp.lqr.loop.controller import Controller
-from softgrasp.lqr.loop.filter import Estimate
 from softgrasp.lqr.observer.judge import Judged, Ticks
-from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.program.replan import Replanned
 
 ROUNDING = 1e-15  # of the largest entry of a tick's matrix
 CUT = 3.0  # standard deviations at which noise and disturbances of a run are cut
-
-
-@dataclass(frozen=True)
-class Tube:
-    """A plan and the feedback around it."""
-
-    controller: Controller  # optimal gain, filter and limits
-    inputs: Array  # u_nom of every interval of the horizon [N], (H, n_s)
-    end: Array  # state of the plan's plant at the end of the horizon, from the target, (k,)
-    closed: Array  # the state an interval later under its gain, (k, k)
-    K: Array  # gain of the grid, (n_s, k)
-    start: Array  # x_nom at t = 0, (N,)
-    each: int  # ticks of an interval
-
-
-def make_tube(plan: Plan, controller: Controller) -> Tube:
-    """The tube of a plan. Raises ControlError: an interval is no multiple of the tick, or there is no observer."""
-    plant, task = plan.horizon.plant, plan.task
-    each = round(plant.grid / controller.period)
-    if controller.observer is None or abs(each * controller.period - plant.grid) > 1e-9 * plant.grid:
-        raise ControlError(
-            f"control.constraints.grid = {plant.grid:g} s must be a multiple of the tick of {controller.period:g} s of "
-            "a loop with observer"
-        )
-    start = controller.x_bar.copy()
-    start[: plant.n_s] += task.start[: plant.n_s]
-    end = plan.horizon.state(task.start, plan.c)[-1, -1]
-    return Tube(controller, plan.inputs, end, plant.closed, plant.K, start, each)
-
-
-class TubeRun:
-    """What the tube of a plan carries from tick to tick."""
-
-    def __init__(self, tube: Tube) -> None:
-        own = tube.controller.observer
-        assert own is not None
-        self.tube, self.filter, self.tick = tube, own, 0
-        self.nominal, self.behind = tube.start, tube.end
-        self.estimate = Estimate(own, tube.start)
-        limits = tube.controller.limits
-        self.limits = np.full(len(tube.K), np.inf) if limits is None else limits
-
-    def step(self, q_s: Array, v_s: Array, y: Array | None = None) -> Array:
-        """One tick: the load [N, N m] from the samples, see :meth:`softgrasp.lqr.loop.controller.Controller.step`."""
-        tube, (interval, begun) = self.tube, divmod(self.tick, self.tube.each)
-        if interval < len(tube.inputs):
-            planned = tube.inputs[interval]
-        else:
-            if begun == 0 and interval > len(tube.inputs):
-                self.behind = tube.closed @ self.behind
-            planned = tube.controller.u_bar + tube.K @ self.behind
-        off = self.estimate.correct(q_s, v_s, y) - self.nominal
-        u: Array = np.clip(planned + tube.controller.K @ off, -self.limits, self.limits)
-        self.estimate.apply(u)
-        self.nominal = self.filter.A @ self.nominal + self.filter.B @ planned + self.filter.f
-        self.tick += 1
-        return u
 
 
 def node_rows(tissue: ModalTissue, n_s: int) -> Array:
@@ -104,26 +44,41 @@ class TubeTrajectory:
     times: Array  # [s], (count,)
     moved: Array  # of the nodes from their places at the target [m], (count, nodes, d)
     inputs: Array  # [N], (count, n_s)
+    log: tuple[Replanned, ...]  # how every interval began
 
 
-def run_tube(tube: Tube, plant: Ticks, rows: Array, ticks: int, every: int, seed: int | None = 0) -> TubeTrajectory:
+def run_tube(
+    controller: Controller,
+    plant: Ticks,
+    rows: Array,
+    ticks: int,
+    every: int,
+    seed: int | None = 0,
+    again: bool = True,
+    push: Callable[[int], Array | float] = lambda tick: 0.0,
+) -> TubeTrajectory:
     """The full plant from the start of the plan, one exact step a tick. Not collective.
 
     Noise and disturbances are normal, cut at :data:`CUT` standard deviations.
 
     Args:
+        controller: of a plan; a copy of it runs.
         rows: see :func:`node_rows`.
         every: ticks between two places that are kept.
         seed: of the noise; None: there is none.
+        again: whether plans are made again at every interval, else the first one is followed.
+        push: load on the hand that nobody knows of, by the tick [N], (n_s,).
     """
-    own, run = tube.controller, TubeRun(tube)
-    n_s, generator = own.n_s, np.random.default_rng(seed)
+    own, generator = deepcopy(controller), np.random.default_rng(seed)
+    own.reset()
+    program, n_s, filter_ = own.planner, own.n_s, own.observer
+    assert program is not None
+    own.replanner.again = again
     A = scipy.sparse.csr_array(np.where(np.abs(plant.A) > ROUNDING * np.abs(plant.A).max(), plant.A, 0.0))
-    target = own.x_bar[:n_s]
     x = np.zeros(len(plant.A))
-    x[:n_s] = tube.start[:n_s] - target
-    held = own.observer.C @ own.x_bar if own.observer is not None else np.zeros(0)  # samples at the target
-    first = len(held) - (own.observer.others if own.observer is not None else 0)
+    x[:n_s] = (program.rest - own.x_bar)[:n_s]
+    held = own.x_bar[: 2 * n_s] if filter_ is None else filter_.C @ own.x_bar
+    first = len(held) - (0 if filter_ is None else filter_.others)
     count, size, sampled = -(-ticks // every), plant.W.shape[1], len(plant.C)
     moved, inputs = np.empty((count, *rows.shape[:2])), np.empty((count, n_s))
     for tick in range(ticks):
@@ -131,9 +86,10 @@ def run_tube(tube: Tube, plant: Ticks, rows: Array, ticks: int, every: int, seed
         if seed is not None:
             noise = np.clip(generator.standard_normal(size + sampled), -CUT, CUT)
         sample = plant.C @ x + held + plant.sd * noise[size:]
-        u = run.step(sample[:n_s], sample[n_s:first], sample[first:])
+        v = sample[n_s:first] if first > n_s else np.zeros(n_s)  # not measured
+        u = own.step(sample[:n_s], v, None if filter_ is None else sample[first:])
         if tick % every == 0:
             moved[tick // every], inputs[tick // every] = rows @ x, u
-        x = A @ x + plant.B @ (u - own.u_bar) + plant.W @ noise[:size]
+        x = A @ x + plant.B @ (u - own.u_bar + push(tick)) + plant.W @ noise[:size]
     times: Array = np.arange(count, dtype=np.float64) * (every * plant.period)
-    return TubeTrajectory(times, moved, inputs)
+    return TubeTrajectory(times, moved, inputs, tuple(own.replanner.log))

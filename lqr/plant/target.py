@@ -69,32 +69,6 @@ def hand_target(problem: RiccatiProblem, q_bar: Array) -> Target:
     return _at(problem, q, equilibrium(problem.system))
 
 
-def output_target(problem: RiccatiProblem, y_bar: Array) -> Target:
-    """Rest with the outputs at y_bar: the hand moves there plus what gravity makes them sag. Collective.
-
-    Solves C_s q_bar = y_bar - C_z' z_bar; among several hand positions it is the one nearest to 0.
-
-    Raises:
-        ControlError: y_bar has another number of entries, or no position of the hand brings the outputs there.
-        SolverError: the equilibrium under gravity fails.
-    """
-    y = np.asarray(y_bar, dtype=np.float64).ravel()
-    C_s = problem.C_s
-    if len(y) != len(C_s) or not np.isfinite(y).all():
-        raise ControlError(f"the target {y.tolist()} of the outputs must have {len(C_s)} finite entries")
-    z = equilibrium(problem.system)
-    right = y - total(problem.layout.comm, problem.C_z.T @ z)
-    q = np.linalg.lstsq(C_s, right)[0]
-    miss = float(np.abs(C_s @ q - right).max())
-    # rounding of the least squares, far below any length that counts
-    if miss > 1e-9 * (1.0 + float(np.abs(right).max())):
-        raise ControlError(
-            f"no position of the hand brings the outputs to {y.tolist()}, the nearest misses by {miss:.3g} m; "
-            "give a target that the body reaches at rest"
-        )
-    return _at(problem, np.asarray(q), z)
-
-
 def _at(problem: RiccatiProblem, q: Array, z: Array) -> Target:
     n_s, n = problem.layout.n_s, problem.layout.n_local
     state = PlantState(q, np.zeros(n_s), z, np.zeros(n))

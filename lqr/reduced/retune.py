@@ -18,14 +18,6 @@ from softgrasp.lqr.reduced.riccati import NAN, GainCheck, GainQuality, full_gain
 Materials = tuple[LayerMaterial, ...]
 
 
-@dataclass(frozen=True)
-class Tuned:
-    """Gain for one setting of the materials."""
-
-    P_N: Array  # Riccati solution in the retuner's scaled basis, (N, N)
-    K_N: Array  # gain u = K_N x_N on reduced states, (n_s, N)
-
-
 class Retuner:
     """A_N = A_0 + sum_layers sum_{mu, lambda} theta (A_j + beta A'_j), A_j = -W_v'K_j U_z, A'_j = -W_v'K_j U_v.
 
@@ -69,14 +61,12 @@ class Retuner:
                 raise ControlError(f"rho = {new.rho:g} differs from {old.rho:g}; re-tuning covers lambda, mu and beta")
         return replace(self.matrices, A=self.A_0 + self._stiffness(materials))
 
-    def solve(self, materials: Materials) -> Tuned:
-        """Combine, solve, gain.
+    def solve(self, materials: Materials) -> Array:
+        """Riccati solution P_N at one setting of the materials in the scaled basis, (N, N).
 
         Raises ControlError: the setting is refused, or its reduced equation has no stabilising solution.
         """
-        m = self.at(materials)
-        P_N = solve_reduced(m)
-        return Tuned(P_N, -np.linalg.solve(m.R, m.B.T @ P_N @ m.E))
+        return solve_reduced(self.at(materials))
 
 
 @dataclass(frozen=True)
@@ -93,7 +83,7 @@ def retuned_gain(retuner: Retuner, materials: Materials, gain_check: Callable[[]
     ``gain_check``: with the full solution at this setting; called where the re-tuned equation has one.
     """
     try:
-        tuned = on_root(retuner.problem.layout.comm, lambda: retuner.solve(materials))
+        P_N = on_root(retuner.problem.layout.comm, lambda: retuner.solve(materials))
     except ControlError as error:
         return RetunedGain(materials, reason=str(error))
-    return gain_check().with_quality(RetunedGain(materials), full_gain(retuner.problem, retuner.basis, tuned.P_N))
+    return gain_check().with_quality(RetunedGain(materials), full_gain(retuner.problem, retuner.basis, P_N))

@@ -144,7 +144,7 @@ def test_reasons_where_there_is_no_bound() -> None:
         assert abs(found.value - poles(problem, K).real.max()) < 1e-8  # tolerance 1e-9 of poles of size 10
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 def test_gains_of_one_circle_share_a_factor(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, made = small(KELVIN), list[str]()
     make = certificate.make_solver

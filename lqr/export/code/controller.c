@@ -5,16 +5,62 @@
 
 enum { N = SG_CONTROLLER_N, M = SG_CONTROLLER_INPUTS, TISSUE = N - 2 * M };
 
+#if SG_CONTROLLER_OBSERVER || SG_CONTROLLER_PLAN
+/* x becomes A x + B u + f. */
+static void ahead(double x[N], const double u[M]) {
+    double next[N];
+    for (int i = 0; i < N; ++i) next[i] = LOAD[i];
+    for (int j = 0; j < N; ++j) add(x[j], A[j], next, N);
+    for (int j = 0; j < M; ++j) add(u[j], B[j], next, N);
+    for (int i = 0; i < N; ++i) x[i] = next[i];
+}
+#endif
+
+#if SG_CONTROLLER_PLAN
+#include "plan_controller.h"
+
+void sg_controller_interval(sg_controller *c, const double x[N], double u[M]) {
+    begin_interval(&c->plan, c->ticks / SG_PLAN_EVERY, x);
+    c->ticks += SG_PLAN_EVERY;
+    for (int k = 0; k < SG_PLAN_EVERY; ++k) ahead(c->plan.nominal, c->plan.input);
+    for (int i = 0; i < M; ++i) u[i] = c->plan.input[i];
+}
+
+void sg_controller_begin(double x[N]) {
+    for (int i = 0; i < N; ++i) x[i] = PLAN_REST[i];
+}
+
+void sg_controller_ahead(double x[N], const double u[M]) { ahead(x, u); }
+
+void sg_controller_samples(const double x[N], double *y) {
+#if SG_CONTROLLER_OBSERVER
+    double all[SG_CONTROLLER_SAMPLES] = {0};
+    for (int j = 0; j < N; ++j) add(x[j], C[j], all, SG_CONTROLLER_SAMPLES);
+    for (int i = 0; i < SG_CONTROLLER_OTHERS; ++i) y[i] = all[SG_CONTROLLER_HAND + i];
+#else
+    (void)x, (void)y;
+#endif
+}
+#endif
+
 void sg_controller_start(sg_controller *controller) {
     static const sg_controller nothing;
     *controller = nothing;
     for (int i = 0; i < TISSUE; ++i) controller->x[2 * M + i] = REST[i];
+#if SG_CONTROLLER_PLAN
+    start_plan(&controller->plan);
+#endif
 }
 
-/* u = clip(offset + K x); 0 where it is not finite. */
-static int command(const double x[N], double u[M]) {
+/* u = clip(offset + K x), or what a plan asks for, made again only from a fresh x; 0 where it is not finite. */
+static int command(sg_controller *c, const double x[N], int fresh, double u[M]) {
+#if SG_CONTROLLER_PLAN
+    follow_plan(&c->plan, c->ticks, x, fresh, u);
+#else
+    (void)c, (void)fresh;
     for (int i = 0; i < M; ++i) u[i] = OFFSET[i];
     for (int j = 0; j < N; ++j) add(x[j], K[j], u, M);
+#endif
     if (defect(u, M) != 0) return 0;
 #if SG_CONTROLLER_LIMITED
     for (int i = 0; i < M; ++i) u[i] = u[i] > LIMIT[i] ? LIMIT[i] : u[i] < -LIMIT[i] ? -LIMIT[i] : u[i];
@@ -24,15 +70,6 @@ static int command(const double x[N], double u[M]) {
 
 #if SG_CONTROLLER_OBSERVER
 enum { DELAY = SG_CONTROLLER_DELAY, HAND = SG_CONTROLLER_HAND, P = SG_CONTROLLER_SAMPLES };
-
-/* x becomes A x + B u + f. */
-static void ahead(double x[N], const double u[M]) {
-    double next[N];
-    for (int i = 0; i < N; ++i) next[i] = LOAD[i];
-    for (int j = 0; j < N; ++j) add(x[j], A[j], next, N);
-    for (int j = 0; j < M; ++j) add(u[j], B[j], next, N);
-    for (int i = 0; i < N; ++i) x[i] = next[i];
-}
 
 /* x becomes x + M (s - C x), where samples that are not finite show nothing; returns their number. */
 static int correct(double x[N], const double *hand, const double *y) {
@@ -114,13 +151,14 @@ int sg_controller_tick(sg_controller *c, const double q[M], const double v[M], c
     if (measured) carry(c, q, v);
     for (int i = 0; i < N; ++i) x[i] = c->x[i];
 #endif
-    int good = command(x, load);
+    int good = command(c, x, SG_CONTROLLER_OBSERVER || measured, load);
+#if !SG_CONTROLLER_OBSERVER
+    good = good && measured;
+#endif
     if (good)
         for (int i = 0; i < M; ++i) c->u[i] = load[i];
 #if SG_CONTROLLER_OBSERVER
     apply(c, c->u);
-#else
-    good = good && measured;
 #endif
     ++c->ticks;
     c->lost += lost > 0;

@@ -8,6 +8,7 @@
 enum { M = SG_CONTROLLER_INPUTS, Y = SG_CONTROLLER_OTHERS };
 
 static sg_controller controller;
+static long intervals, others; /* plans that were made, counts of their outcomes that differ */
 
 /* Largest difference of a load over the largest one of its unit; -1 if the log is not whole. */
 static double replay(FILE *log, long *ticks, double *tolerance) {
@@ -24,11 +25,24 @@ static double replay(FILE *log, long *ticks, double *tolerance) {
             if (!numbers(log, q, M) || !numbers(log, v, M) || !numbers(log, y, Y) || !numbers(log, golden, M)) return -1;
             int status = sg_controller_tick(&controller, q, v, y, u);
             if (status > SG_CONTROLLER_LOST) return printf("%s\n", sg_controller_message(status)), -1;
+            worst = larger(worst, u, golden, scale, M);
+            ++*ticks;
+#if SG_CONTROLLER_PLAN
+        } else if (!strcmp(word, "interval")) {
+            double x[SG_CONTROLLER_N];
+            if (!numbers(log, x, SG_CONTROLLER_N) || !numbers(log, golden, M)) return -1;
+            sg_controller_interval(&controller, x, u);
             for (int i = 0; i < M; ++i) {
                 double difference = size(u[i] - golden[i]) / scale[i];
                 if (!(difference <= worst)) worst = difference;
             }
-            ++*ticks;
+            ++intervals;
+        } else if (!strcmp(word, "outcomes")) { /* of the plans of these intervals */
+            double outcomes[3];
+            if (!numbers(log, outcomes, 3)) return -1;
+            for (int i = 0; i < 3; ++i) others += controller.plan.outcomes[i] != (long)outcomes[i];
+            others += controller.plan.limited != 0;
+#endif
         } else {
             return -1;
         }
@@ -52,18 +66,30 @@ static int withstands(void) {
         return 0;
     long counted = controller.lost + controller.held - before; /* with a delay a lost sample counts when it is used */
     int now = !SG_CONTROLLER_OBSERVER || SG_CONTROLLER_DELAY == 0;
-    return defect(u, M) == 0 && controller.ticks == 2 && counted >= now;
+    if (defect(u, M) != 0 || controller.ticks != 2 || counted < now) return 0;
+#if SG_CONTROLLER_PLAN && !SG_CONTROLLER_OBSERVER
+    double x[SG_CONTROLLER_N];
+    sg_controller_start(&controller);
+    sg_controller_begin(x);
+    for (int k = 0; k < SG_PLAN_EVERY; ++k) { /* no plan begins from the state of a tick before */
+        sg_controller_tick(&controller, x, x + M, NULL, u);
+        sg_controller_ahead(x, u);
+    }
+    long old = controller.plan.outcomes[SG_PLAN_KEPT];
+    if (sg_controller_tick(&controller, q, v, NULL, u) != SG_CONTROLLER_HELD) return 0;
+    if (controller.plan.outcomes[SG_PLAN_KEPT] != old + 1 || defect(u, M) != 0) return 0;
+#endif
+    return 1;
 }
 
 int main(int count, char **words) {
-    FILE *log = count == 2 ? fopen(words[1], "r") : NULL;
     long ticks = 0;
-    double tolerance = 0, worst = log ? replay(log, &ticks, &tolerance) : -1;
-    if (log) fclose(log);
-    if (worst < 0) return printf("name the golden.log beside this program; it must be whole\n"), 2;
+    double tolerance = 0, worst = replayed(count, words, replay, &ticks, &tolerance);
+    if (worst < 0) return 2;
     long lost = controller.lost, held = controller.held;
     int good = withstands();
     printf("%ld ticks: largest relative difference of a load %.1e, allowed %.0e; ", ticks, worst, tolerance);
     printf("%ld with lost samples, %ld held; bad samples %s\n", lost, held, good ? "withstood" : "NOT withstood");
-    return !(worst <= tolerance && good && held == 0);
+    if (intervals) printf("%ld plans, their outcomes %s\n", intervals, others ? "differ" : "the same");
+    return others || !(worst <= tolerance && good && held == 0);
 }

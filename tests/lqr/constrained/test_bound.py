@@ -59,7 +59,7 @@ def test_bound_holds_and_is_attained() -> None:
     pulses = PulseError(full, full.reduced(5), GRID)
     largest = np.array([0.4, 0.2])
     bound, parts = pulses.bound(largest), 7
-    for _ in range(100):
+    for _ in range(1000):
         a = largest * rng.choice([-1, 1], (40, 2)) * rng.uniform(0.5, 1, (40, 2))
         assert (np.abs(errors(full, pulses.reduced, a, parts)).max(axis=(0, 1)) <= bound).all()
     s = GRID * 3 / parts

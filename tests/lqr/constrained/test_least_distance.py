@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softgrasp.lqr.constrained.least_distance import InfeasibleError, nearest, nearest_soft
+from softgrasp.lqr.program.least_distance import InfeasibleError, nearest, nearest_soft
 from tests.helpers.least_distance import least_squares
 
 

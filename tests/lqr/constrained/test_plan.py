@@ -15,7 +15,6 @@ from softgrasp.fem.obstacles.shapes import Ball, HalfSpace, Shape
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.constrained import plan as planning
 from softgrasp.lqr.constrained.horizon import HeldPlant, held_plant
-from softgrasp.lqr.constrained.least_distance import nearest
 from softgrasp.lqr.constrained.plan import Plan, Task, make_plan, quadratic_program
 from softgrasp.lqr.constrained.pulse import PulseError
 from softgrasp.lqr.constrained.rows import Limits, follow
@@ -25,6 +24,7 @@ from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import hand_target, rest
+from softgrasp.lqr.program.least_distance import nearest
 from softgrasp.lqr.riccati import solve
 from tests.helpers.least_distance import least_squares
 
@@ -109,7 +109,7 @@ def test_disc_is_passed_on_the_cheaper_side() -> None:
     assert all(b < a for a, b in zip(plan.costs, plan.costs[1:], strict=False))  # every round is safe for the next
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 def test_plan_of_a_small_plant_is_the_same_on_all_ranks() -> None:
     plant, given = task(14, WALL, DISC, cells="[4, 8]")
     plan = make_plan(plant, given, 30)

@@ -27,7 +27,7 @@ from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import hand_target, rest
 from tests.helpers.models import close, gather_rows, make_scene, same_everywhere
-from tests.helpers.small_loop import run_small
+from tests.helpers.small_loop import expand, expand_gain, run_small
 
 Array = np.ndarray
 Q, R = 30.0, 0.5
@@ -87,10 +87,10 @@ def test_controller_gives_the_sampled_loop(problem: RiccatiProblem, small: tuple
     controller = make_controller(small, AIM, period=0.02, limits=np.array([3.0, 45.0]))
     target = hand_target(problem, AIM)
     loop = ClosedLoop(problem, 0.01)
-    run = loop.run(shapes.expand_gain(problem, K), target, 100, Actuation(rate=50.0, limits=(3.0, 45.0)))
+    run = loop.run(expand_gain(shapes, problem, K), target, 100, Actuation(rate=50.0, limits=(3.0, 45.0)))
     u = controller.command(shapes.reduce(problem, run.final))
     later = loop.run(
-        shapes.expand_gain(problem, K), target, 1, Actuation(rate=50.0, limits=(3.0, 45.0)), start=run.final
+        expand_gain(shapes, problem, K), target, 1, Actuation(rate=50.0, limits=(3.0, 45.0)), start=run.final
     )
     # the target of the ten modes lacks the sag of the others, which their filter does not see
     assert close(u, later.inputs[0]) < 1e-11  # rounding: modes are decoupled
@@ -105,7 +105,7 @@ def test_controller_carries_the_tissue_without_an_observer(
     plant, shapes, K = small
     target, dt, steps = hand_target(problem, AIM), 0.01, 200
     loop = ClosedLoop(problem, dt)
-    run = loop.run(shapes.expand_gain(problem, K), target, steps)
+    run = loop.run(expand_gain(shapes, problem, K), target, steps)
     loop.destroy()
     controller = make_controller(small, AIM, period=dt)
     for q, v in zip(run.q_s, run.v_s, strict=True):
@@ -194,7 +194,7 @@ def test_a_full_gain_survives_its_file(
 ) -> None:
     comm, layout = problem.layout.comm, problem.layout
     folder = comm.bcast(tmp_path_factory.mktemp("gain") if comm.rank == 0 else None)
-    gain = small[1].expand_gain(problem, small[2])
+    gain = expand_gain(small[1], problem, small[2])
     state = hand_target(problem, AIM).state
     path = save_gain(folder / "full.npz", gain, state, layout, scene_hash(model.scene))
     again, target = load_gain(path, layout, scene_hash(model.scene))
@@ -291,6 +291,6 @@ def test_start_state_round_trip(problem: RiccatiProblem, small: tuple[ReducedSys
     """reduce(expand(x)) = x, and expand keeps what the shapes can hold."""
     _, shapes, _ = small
     x = np.random.default_rng(5).standard_normal(small[0].N)
-    assert close(shapes.reduce(problem, shapes.expand(problem, x)), x) < 1e-12  # W'V = I
+    assert close(shapes.reduce(problem, expand(shapes, problem, x)), x) < 1e-12  # W'V = I
     state = rest(problem.system)
     assert isinstance(state, PlantState)

@@ -43,7 +43,7 @@ def loops(
     return found, linear, run, problem
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 @pytest.mark.parametrize("effects", [{}, {"reaction": True}, FALL, {**FALL, "reaction": True}], ids=str)
 @pytest.mark.parametrize("room", [None, 1.0])
 def test_every_step_obeys_law_and_limits(effects: dict[str, Any], room: float | None) -> None:

@@ -17,10 +17,11 @@ from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions
 from softgrasp.lqr.loop.small import galerkin, m_orthonormal
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
-from softgrasp.lqr.plant.target import hand_target, output_target, rest
+from softgrasp.lqr.plant.target import hand_target, rest
+from softgrasp.reduction.errors import full_energy
 from tests.helpers.loop import CASES, Setup, aim, enumerate_input, plain_loop, setup
 from tests.helpers.models import close, gather_rows, gather_states, local_rows, same_everywhere
-from tests.helpers.small_loop import run_small
+from tests.helpers.small_loop import expand, expand_gain, run_small
 
 Array = np.ndarray
 STEPS, END = 40, 4.0
@@ -57,6 +58,9 @@ def test_full_order_loop_is_the_dense_recursion(case: Setup) -> None:
     assert close(run.outputs_rigid, run.q_s @ case.problem.C_s.T) < 1e-14  # the same product
     assert close(case.full(run.final), X[-1]) < 1e-8  # the last state is smaller than the largest
     assert same_everywhere(case.problem.layout.comm, run.inputs)
+    exact = full_energy(case.problem.system, run.snapshots.Z)
+    # the balance of 40 steps, each of sums larger than the energy where gravity does work
+    assert np.abs(run.energy - exact).max() < 1e-10 * max(exact.max(), run.dissipated[-1])
     assert 0 < max(run.residuals) < 1e-12  # rounding of direct solves
     assert run.residuals[0] != run.residuals[1]  # of the first and of the last step
     assert run.inputs.shape == (STEPS, n_s)
@@ -195,22 +199,8 @@ def test_observers_see_the_run() -> None:
     loop.destroy()
 
 
-def test_output_target_moves_the_hand_past_the_sag() -> None:
-    case = setup("two_way")
-    target = output_target(case.problem, np.array([1.0, 2.0]))
-    assert close(target.y, [1.0, 2.0]) < 1e-12  # one small solve
-    assert np.abs(target.state.q_s - [1.0, 2.0]).max() > 1e-3  # gravity deforms
-    loop = ClosedLoop(case.problem, 0.1)
-    run = loop.run(case.gain, target, 400)
-    assert close(run.outputs[-1], target.y) < 1e-3  # slowest pole -0.2: exp(-8) = 3e-4 of the way
-    assert close(run.inputs[-1], target.u) < 1e-3  # as above
-    loop.destroy()
-
-
-def test_an_unreachable_output_is_refused() -> None:
+def test_a_target_of_another_length_is_refused() -> None:
     case = setup("space_gravity")
-    with pytest.raises(ControlError, match="no position of the hand"):
-        output_target(case.problem, np.array([1.0, 2.0, 50.0, 0.0, 0.0]))
     with pytest.raises(ControlError, match="2 or 3 finite"):
         hand_target(case.problem, np.array([1.0]))
 
@@ -257,7 +247,7 @@ def test_all_shapes_give_the_full_loop(case: Setup) -> None:
     assert close(shapes.reduce(problem, target.state), x_bar) < 1e-9  # condition of K
     assert close(u_bar, target.u) < 1e-9 or np.abs(u_bar - target.u).max() < 1e-9  # zero without gravity
     K = shapes.reduce_gain(problem, case.gain)
-    back = shapes.expand_gain(problem, K)
+    back = expand_gain(shapes, problem, K)
     assert close(gather_rows(problem.layout, back.K_z), gather_rows(problem.layout, case.gain.K_z)) < 1e-12  # V'MV = I
     loop = ClosedLoop(problem, dt)
     limit = tuple(1.3 * np.abs(target.u) + 2.0)
@@ -268,7 +258,7 @@ def test_all_shapes_give_the_full_loop(case: Setup) -> None:
         assert close(small.inputs, run.inputs) < 1e-8  # as above
         assert close(small.cost, run.cost) < 1e-8  # as above
         assert small.saturated == run.saturated
-        end = shapes.expand(problem, small.states[-1])
+        end = expand(shapes, problem, small.states[-1])
         assert close(gather_rows(problem.layout, end.z), gather_rows(problem.layout, run.final.z)) < 1e-6  # small end
     loop.destroy()
 

@@ -53,7 +53,7 @@ def test_solves_are_those_of_scipy(name: str, monkeypatch: pytest.MonkeyPatch) -
     tissue.destroy()
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 @pytest.mark.parametrize("beta", [5e-3, 4e-4])
 def test_gain_is_that_of_newton(beta: float, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(galerkin, "DEFINITE_FROM", 0)

@@ -35,7 +35,7 @@ def observed(*overrides: str) -> tuple[Design, ObservedControl, Ticks]:
     return made, found, make_ticks(made.problem, found.loop, found.sensors, acting, found.controller.period)
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 @pytest.mark.parametrize(("Q", "most"), [("1.0", 0.002), ("1e6", 0.11)])
 def test_loop_with_observer_is_as_fast_as_with_the_state_known(Q: str, most: float) -> None:
     judged = observed(f"control.Q={Q}")[1].judged

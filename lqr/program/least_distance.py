@@ -125,9 +125,15 @@ class SoftNearest:
 
 
 def nearest_soft(
-    G: Array, h: Array, group: NDArray[np.int64], hard: tuple[Array, Array], penalty: float, limit: int = 10_000
+    G: Array,
+    h: Array,
+    group: NDArray[np.int64],
+    hard: tuple[Array, Array],
+    penalty: float,
+    limit: int = 10_000,
+    weight: float = 1.0,
 ) -> SoftNearest:
-    """The solution of min |x|^2 / 2 + sum_i (penalty e_i + e_i^2 / 2), G x <= h + e of the row's group, e >= 0.
+    """The solution of min |x|^2 / 2 + sum_i (penalty e_i + weight e_i^2 / 2), G x <= h + e of the row's group, e >= 0.
 
     The penalty is exact: e = 0 wherever some x keeps all rows and the multipliers of each group add to less than it.
 
@@ -136,16 +142,18 @@ def nearest_soft(
         group: number of the group of each row, from 0, (m,).
         hard: rows that are never exceeded.
         penalty: price of a unit of e.
+        weight: of the squares of e; with the square of the penalty all numbers are of the size of x.
 
     Raises InfeasibleError: the hard rows alone cannot be kept.
     """
     count, n = int(group.max(initial=-1)) + 1, G.shape[1]
-    # with e = e' - penalty the problem is one of least distance again
+    # with e = e' / root - penalty / weight the problem is one of least distance again
+    root, free = weight**0.5, penalty / weight
     rows = np.zeros((len(h) + len(hard[1]) + count, n + count))
     rows[: len(h), :n], rows[len(h) : len(rows) - count, :n] = G, hard[0]
-    rows[np.arange(len(h)), n + group] = -1.0
+    rows[np.arange(len(h)), n + group] = -1.0 / root
     rows[len(rows) - count :, n:] = -np.eye(count)
-    right = np.concatenate([h - penalty, hard[1], np.full(count, -penalty)])
+    right = np.concatenate([h - free, hard[1], np.full(count, -root * free)])
     found = nearest(rows, right, range(len(rows) - count, len(rows)), limit)
-    slack = np.maximum(found.x[n:] - penalty, 0.0)
+    slack = np.maximum(found.x[n:] / root - free, 0.0)
     return SoftNearest(found.x[:n], slack, found.multipliers[: len(rows) - count], found.steps)
