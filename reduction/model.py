@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem.material import LayerMaterial, in_words
+from softgrasp.fem.material import LayerMaterial, differs, in_words, of_layers
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.shown import Card, Shown, drawn, listed
 from softgrasp.reduction.bases.basis import Coordinates, Frame, Structure
@@ -88,6 +89,16 @@ class ReducedModel(Shown):
         """
         return drawn("model_errors", self, model, run)
 
+    def to_pymor(self) -> Any:
+        """The model as ``pymor.models.iosys.LTIModel``, affine in ``mu``, ``lambda`` [Pa], ``beta`` [s] of each layer.
+
+        A (q, v) model is affine in ``rho`` [kg/m^3] too; only a damped one has ``beta``. B and C are called as their
+        columns and rows, with units; gravity, which only moves the state of rest, is left out.
+
+        Raises SoftgraspError: pyMOR is not installed, or the program runs on several ranks.
+        """
+        return import_module("softgrasp.reduction.export.pymor").parametric(self)  # a room above this one
+
     def at(self, materials: tuple[LayerMaterial, ...] | None = None, gravity: Array | None = None) -> EnergySystem:
         """Assemble E x' = A x + B u + F g at new materials and gravity. Online; not collective.
 
@@ -118,7 +129,9 @@ class ReducedModel(Shown):
         """
         if len(materials) != len(self.materials):
             raise ModelError(f"{len(materials)} materials are given; the model has {len(self.materials)} layers")
-        for m in materials:
+        if text := differs(materials, self.materials):
+            raise ModelError(text)
+        for m in of_layers(materials):
             if not (m.mu > 0 and m.lam > -2 * m.mu / 3 and m.rho > 0 and m.beta >= 0):
                 raise ModelError(
                     f"lambda = {m.lam:g} Pa, mu = {m.mu:g} Pa, rho = {m.rho:g} kg/m3, beta = {m.beta:g} s is no "

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from softgrasp.fem.columns import TURNS
-from softgrasp.fem.labelled import Labelled, Quantity, of_hand
+from softgrasp.fem.labelled import Labelled, Quantity, of_energy, of_hand
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.reduced import march_together
 from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
@@ -37,6 +38,16 @@ class ReducedTrajectory(Shown, Labelled):
     """Outputs y [m, rad], (steps + 1, p)."""
     output_names: tuple[str, ...]
     """Name of every output, (p,)."""
+    system: EnergySystem | Callable[[], EnergySystem] | None = field(default=None, repr=False, kw_only=True)
+    """System of the run, or what makes it: it knows the energy; None where the run's own class does."""
+
+    @cached_property
+    def energy(self) -> Array | None:
+        """Energy of the tissue at each time [J], (steps + 1,), computed at the first use; None without a system."""
+        if self.system is None:
+            return None
+        system = self.system if isinstance(self.system, EnergySystem) else self.system()
+        return system.energy(self.x)
 
     def card(self) -> Card:
         """Steps, dimension and outputs."""
@@ -53,12 +64,13 @@ class ReducedTrajectory(Shown, Labelled):
 
     @property
     def quantities(self) -> dict[str, Quantity]:
-        """Outputs and hand over time with their labels and units."""
+        """Outputs, hand and energy over time with their labels and units."""
         units = tuple("rad" if name.rsplit("_", 1)[-1] in TURNS else "m" for name in self.output_names)
         return {
             "outputs": Quantity(self.outputs, self.output_names, units, "output"),
             "q_s": of_hand(self.q_s, self.output_names),
             "v_s": of_hand(self.v_s, self.output_names, rate="/s"),
+            **({} if self.energy is None else {"energy": of_energy(self.energy)}),
         }
 
 
@@ -152,7 +164,7 @@ def trajectory(step: Propagator, w: Array, hand: tuple[Array, Array] | None) -> 
         q, v = hand
         x = np.hstack([consistent(q, v, step.dt), v, x])
         y = x @ model.C.T + (q - x[:, : model.n_s]) @ model.C_s.T
-    return ReducedTrajectory(step.dt * np.arange(float(len(x))), x, q, v, y, model.names)
+    return ReducedTrajectory(step.dt * np.arange(float(len(x))), x, q, v, y, model.names, system=model)
 
 
 class Stepper:

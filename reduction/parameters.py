@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 
-from softgrasp.fem.material import LayerMaterial
+from softgrasp.fem.material import LayerMaterial, scaled
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.snapshots import Snapshots
@@ -35,6 +35,9 @@ def box_of(model: Model) -> tuple[list[float], list[float]]:
 def outside(model: Model) -> str:
     """Why the scene's own constants lie outside the box, so that errors there are not its own; empty when inside."""
     first, box = model.system.materials[0], box_of(model)
+    for key, _ in first.fixed:
+        if key in ("lam", "mu"):
+            return f"the tangent of the energy is not affine in {key}"
     for key, value, (low, high) in zip(("lambda", "mu"), (first.lam, first.mu), box, strict=True):
         if value <= 0:
             return f"{key} = {value:.4g} Pa of the scene is not positive, and the box is logarithmic"
@@ -79,7 +82,7 @@ def moved_to(model: Model, target: list[float]) -> Model:
 def materials_at(model: Model, lam: float, mu: float) -> tuple[LayerMaterial, ...]:
     """Materials with these constants in the first layer; the others keep their ratios to it."""
     first = model.system.materials[0]
-    return tuple(replace(m, lam=m.lam * lam / first.lam, mu=m.mu * mu / first.mu) for m in model.system.materials)
+    return scaled(model.system.materials, lam / first.lam, mu / first.mu)
 
 
 def run_at(model: Model, lam: float, mu: float) -> FullRun:

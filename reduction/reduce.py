@@ -81,6 +81,7 @@ def reduce(
         SolverError: a factorisation failed, or a reduced run did not converge.
     """
     model.scene.refuse_contact("a reduced model")
+    model.scene.refuse_frame("a reduced model")
     if not (N is None or isinstance(N, Truncation | Integral)) or isinstance(N, bool):
         raise BasisError(f"N = {shortened(repr(N))} is no dimension; give a whole number, a Truncation or None")
     if not isinstance(runs, Trajectory | FullRun | Sequence):
@@ -204,6 +205,7 @@ def project_scene(basis: Basis, model: Model, outputs: Sequence[Output] | None =
 
 
 def _check_linear(model: Model) -> None:
+    model.scene.refuse_frame("a reduced model")
     if model.system.points is not None:
         raise ReductionError(
             f"scene {model.scene.name} has effects.finite_strain, and this model would be linear; "

@@ -44,8 +44,8 @@ INNERS: tuple[InnerName, ...] = get_args(InnerName)
 class Weight:
     """Symmetric positive definite weight of one half: hand (n_s, n_s) and tissue (n_e, n_e)."""
 
-    hand: Array
-    tissue: PETSc.Mat
+    hand: Array  # block of the hand, (n_s, n_s)
+    tissue: PETSc.Mat  # block of the tissue, (n_e, n_e)
 
 
 def weights(system: BlockSystem, inner: InnerName) -> tuple[Weight, Weight] | None:

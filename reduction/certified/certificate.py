@@ -18,7 +18,7 @@ NORMS = {"energy": "largest energy norm of the deformation", "output": "largest 
 
 
 class ToleranceError(SoftgraspError):
-    """The proved error of a run is above the tolerance.
+    """The error of a run, proved or estimated as its certificate says, is above the tolerance.
 
     Attributes:
         run: the run with its certificate.

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from math import isclose
 from typing import Any, Literal
 
 import numpy as np
 
+from softgrasp.fem.material import scaled
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.shown import Card, Shown, listed
 from softgrasp.reduction.certified import bounds
@@ -137,17 +138,19 @@ class CertifiedModel(Shown):
         """Materials with these numbers in the first layer [Pa, kg/m^3]; the others keep their ratios to it."""
         first = self.fine.materials[0]
         a, b, c = lam / first.lam, mu / first.mu, 1.0 if rho is None else rho / first.rho
-        return tuple(replace(m, lam=m.lam * a, mu=m.mu * b, rho=m.rho * c) for m in self.fine.materials)
+        return scaled(self.fine.materials, a, b, c)
 
     def inside(self, materials: Materials) -> bool:
         """Whether these lie in the box: a motion depends on lambda / rho and mu / rho alone, one-way."""
         if self.box is None:
             return True
         own, first = self.fine.materials, self.fine.materials[0]
-        ratios = [(m.lam / o.lam, m.mu / o.mu, m.rho / o.rho) for m, o in zip(materials, own, strict=True)]
+        pairs = list(zip(materials, own, strict=True))
+        ratios = [(m.lam / o.lam, m.mu / o.mu, m.rho / o.rho) for m, o in pairs if not m.part]
         alike = slice(2 if self.box.independent_layers else 0, 3)
         near = all(isclose(x, y) for r in ratios for x, y in list(zip(r, ratios[0], strict=True))[alike])
-        near = near and all(isclose(m.beta, o.beta) for m, o in zip(materials, own, strict=True))
+        near = near and all(isclose(m.beta, o.beta) for m, o in pairs)
+        near = near and all(isclose(m.mu / o.mu, m.rho / o.rho) for m, o in pairs if m.part)
         limits = [
             (low * (1 - 1e-9) <= x / r[2] * base <= high * (1 + 1e-9))
             for r in ratios
@@ -208,7 +211,12 @@ class CertifiedModel(Shown):
         """
         drive, names = self._given(drive), self.fine.outputs.names
         found = self._each(many, drive, tolerance, gravity, prove_time_step)
-        return [CertifiedRun(answer.trajectory(drive.dt, names), certificate) for answer, certificate in found]
+        runs = []
+        for materials, (answer, certificate) in zip(many, found, strict=True):
+            run = answer.trajectory(drive.dt, names)
+            model = self.coarse if run.x.shape[1] == self.coarse.N else self.fine
+            runs.append(CertifiedRun(replace(run, system=partial(model.at, materials)), certificate))
+        return runs
 
     def certificates(self, many: Sequence[Materials], drive: Drive | None = None) -> list[Certificate]:
         """Certificates of :meth:`run_batch`, without the states."""

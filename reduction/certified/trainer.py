@@ -98,6 +98,13 @@ class Trainer:
     def __init__(self, model: Model, earlier: CertifiedModel | None = None) -> None:
         if reason := outside(model):
             raise SceneError(f"{reason}; a certified model needs its box around the scene's own material")
+        model.scene.refuse_frame("a certified model")
+        if (own := model.system.energy) is not None and own.certifiable:
+            raise SceneError(f"the energy {own.law.name} has no certificate: {own.certifiable}; use another reduction")
+        if model.scene._terms:
+            raise SceneError("own terms have no certificate: their share of the stiffness has no known sign; drop them")
+        if any(m.part for m in model.system.materials) and model.scene.reduction.layers == "apart":
+            raise SceneError("reduction.layers = 'apart' cannot go with parameters of an own energy; use 'together'")
         if model.system.points is not None:
             raise SceneError("effects.finite_strain makes the tissue nonlinear; its bound needs linear tissue")
         self.model, self.models = model, motions_of(model)
@@ -133,7 +140,7 @@ class Trainer:
         factors = np.exp(low + draws.reshape(len(draws), -1, 2) * (high - low)) / (own[0].lam, own[0].mu)
         factors = np.broadcast_to(factors, (len(draws), len(own), 2)).tolist()
         return [
-            tuple(replace(m, lam=m.lam * a, mu=m.mu * b) for m, (a, b) in zip(own, each, strict=True))
+            tuple(m if m.part else replace(m, lam=m.lam * a, mu=m.mu * b) for m, (a, b) in zip(own, each, strict=True))
             for each in factors
         ]
 

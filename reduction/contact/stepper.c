@@ -1,20 +1,8 @@
 /* Whole runs of a reduced model with contact; see reduction/contact/stepper.py, which has it in NumPy too. */
-#include <math.h>
-#include <string.h>
-
-#define RIDGE 1e-13
+#include "dense.h"
 
 typedef int (*Complement)(int p, int ld, const double *W, const double *q, double tol, int most, int *count, int *order,
                           double *L, double *x, int *side, double *room, long *tally);
-
-static double dot(int n, const double *a, const double *b) {
-  double s[8] = {0, 0, 0, 0, 0, 0, 0, 0}, r = 0;
-  int i = 0;
-  for (; i + 8 <= n; i += 8)
-    for (int k = 0; k < 8; k++) s[k] += a[i + k] * b[i + k];
-  for (; i < n; i++) r += a[i] * b[i];
-  return r + ((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7]));
-}
 
 /* y with U_AA y = b for the m rows of A, by Cholesky with a ridge for equal rows. */
 static int impulse(int m, int p, const int *rows, const double *U, const double *b, double *L, double *y) {

@@ -19,10 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.obstacles.compiled import contact_library
-from softgrasp.fem.obstacles.small import RIDGE, SmallProblem
+from softgrasp.fem.obstacles.compiled import RIDGE, compiled, contact_library
+from softgrasp.fem.obstacles.small import SmallProblem
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.strain.compiled import library
 
 SOURCE = Path(__file__).with_name("stepper.c")
 DECLARATION = """int softgrasp_contact_march(void *complement, int k, int p, int steps, const double *inverse,
@@ -63,7 +62,7 @@ class ContactSteps:
         a, v = np.zeros((2, steps + 1, k))
         x, y = np.zeros((2, steps, p))
         a[0] = start
-        codes = None if engine == "NumPy" else (contact_library(), library(SOURCE, DECLARATION, "in NumPy, slowly"))
+        codes = None if engine == "NumPy" else (contact_library(), compiled(SOURCE, DECLARATION))
         if codes is None or None in codes:
             if engine == "C":
                 raise SolverError("compiled contact is not available here; leave the engine out")

@@ -10,6 +10,7 @@ E = I where it does not depend on the material.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -86,7 +87,7 @@ def affine_plant(model: ReducedModel, tick: float) -> AffinePlant:
             f"{model.name} with N = {model.N} is unstable (spectral abscissa {system.spectral_abscissa:.2e} 1/s); "
             "export another N or a structure-preserving basis"
         )
-    rest, mu, lam, beta_mu, beta_lambda = _terms(model)
+    rest, mu, lam, beta_mu, beta_lambda = material_terms(model)
     side = "E" if any(term.E.any() for term in (*beta_mu, *beta_lambda)) else "A"
     d = 1 / _powers(np.diag(system.H))
     E = system.E * d
@@ -132,12 +133,12 @@ class Term:
     A: Array  # of the states, (N, N)
 
 
-def _terms(model: ReducedModel) -> tuple[Term, list[Term], list[Term], list[Term], list[Term]]:
+def material_terms(model: ReducedModel) -> tuple[Term, list[Term], list[Term], list[Term], list[Term]]:
     """Terms without stiffness, then of mu, lambda, beta mu, beta lambda of every layer."""
     own = model.parameters(model.materials)
     empty = tuple(replace(m, mu=0.0, lam=0.0, beta=0.0) for m in model.materials)
 
-    def at(i: int, **constants: float) -> Term:
+    def at(i: int, **constants: Any) -> Term:
         materials = (*empty[:i], replace(empty[i], **constants), *empty[i + 1 :])
         system = model.assemble(replace(own, materials=materials))
         return Term(system.E, system.A)
@@ -148,7 +149,7 @@ def _terms(model: ReducedModel) -> tuple[Term, list[Term], list[Term], list[Term
     rest = at(0)
     mu, lam, beta_mu, beta_lambda = list[Term](), list[Term](), list[Term](), list[Term]()
     for i, m in enumerate(model.materials):
-        scale = m.mu  # with it the stiffness is not small against the rest
+        scale = m.mu or 1.0  # with it the stiffness is not small against the rest
         for key, stiff, viscous in (("mu", mu, beta_mu), ("lam", lam, beta_lambda)):
             elastic = at(i, **{key: scale})
             stiff.append(slope(elastic, rest, scale))

@@ -25,17 +25,18 @@ def comment(text: str) -> str:
 
 
 def array(name: str, values: Array) -> str:
-    """A constant array, its numbers in hexadecimal and independent of the locale."""
+    """A constant array, its numbers in hexadecimal and independent of the locale; whole numbers stay whole."""
     if not values.size:  # which C does not know
-        values = np.zeros([max(n, 1) for n in values.shape])
+        values = np.zeros([max(n, 1) for n in values.shape], values.dtype)
     sizes = "".join(f"[{n}]" for n in values.shape)
-    return f"static const double {name}{sizes} = {_braces(values)};"
+    kind = "int" if values.dtype.kind == "i" else "double"
+    return f"static const {kind} {name}{sizes} = {_braces(values)};"
 
 
 def _braces(values: Array) -> str:
     if values.ndim > 1:
         return "{\n" + ",\n".join(_braces(part) for part in values) + "}"
-    words = [float(value).hex() for value in values]
+    words = [str(value) if values.dtype.kind == "i" else float(value).hex() for value in values]
     return "{" + ",\n ".join(", ".join(words[i : i + LINE]) for i in range(0, len(words), LINE)) + "}"
 
 

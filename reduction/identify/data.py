@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from softgrasp.fem.errors import SceneError, no_pipe, shortened
 
 FEWEST = 8  # measured numbers: fewer say nothing about their own noise
 FAR = 1000.0  # lengths of the body: a marker farther away has another unit
+TURN = 4 * np.pi  # largest angle of an output [rad]: larger ones are degrees
 TIMES = ("time [s]", "t [s]", "time", "t")
 
 
@@ -75,7 +76,7 @@ def read_measurements(path: Path, outputs: Columns, hand: Columns, end: float, s
         end = float(times[whole][-1])
     rows_seen = np.isfinite(table[:, 1 : 1 + p]).any(axis=1)
     result = Measurements(path.name, times[rows_seen], table[rows_seen, 1 : 1 + p], measured)
-    check(str(path), result, end, size)
+    check(str(path), result, end, size, outputs)
     return result
 
 
@@ -107,21 +108,45 @@ def _number(path: Path, line: int, cell: str) -> float:
     return value
 
 
-def check(what: str, data: Measurements, end: float, size: float) -> None:
+def check(what: str, data: Measurements, end: float, size: float, outputs: Columns) -> None:
     """Refuse data that nothing can be identified from. Raises SceneError: with one sentence."""
     seen, times = data.seen, data.times
+    if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+        raise SceneError(f"{what}: times must be finite and increase from one to the next")
+    if np.isinf(data.values).any():
+        raise SceneError(f"{what}: an output is infinite; a missing sample is nan")
     if seen.sum() < FEWEST:
         raise SceneError(f"{what}: {seen.sum()} measured numbers are too few; give at least {FEWEST}")
     if times[0] < 0 or times[-1] > end * (1 + 1e-9):
         raise SceneError(
             f"{what}: the times run from {times[0]:g} to {times[-1]:g} s, and the hand moves from 0 to {end:g} s"
         )
-    largest = float(np.abs(data.values[seen]).max())
-    if largest > FAR * size:
-        raise SceneError(f"{what}: an output is {largest:.3g} m, and the body is {size:.3g} m long; give metres")
+    for column, values in zip(outputs, data.values.T, strict=True):
+        largest = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+        if column.rotation and largest > TURN:
+            raise SceneError(f"{what}: {column.label} is {largest:.3g} rad, more than two turns; give radians")
+        if not column.rotation and largest > FAR * size:
+            raise SceneError(
+                f"{what}: {column.label} is {largest:.3g} m, and the body is {size:.3g} m long; give metres"
+            )
+    moved = 0.0 if data.hand is None else float(np.abs(data.hand[1]).max())
+    if moved > FAR * size:
+        raise SceneError(f"{what}: the hand moves to {moved:.3g} m, and the body is {size:.3g} m long; give metres")
     low, high = (f(np.where(seen, data.values, s * np.inf), axis=0) for f, s in ((np.min, 1), (np.max, -1)))
     if not (high > low).any():
         raise SceneError(f"{what}: no output moves; nothing can be identified from constants")
+
+
+def told_apart(many: Sequence[Measurements]) -> tuple[Measurements, ...]:
+    """The same with names that differ: what stands twice gets a number."""
+    names = [data.name for data in many]
+    seen: dict[str, int] = {}
+    result = []
+    for data in many:
+        seen[data.name] = seen.get(data.name, 0) + 1
+        alone = names.count(data.name) == 1
+        result.append(data if alone else replace(data, name=f"{data.name} ({seen[data.name]})"))
+    return tuple(result)
 
 
 def parse_noise(text: str, columns: Columns) -> Array:

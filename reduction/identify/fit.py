@@ -9,20 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.identify.near import Experiment, Near
+from softgrasp.reduction.identify.near import Experiment, Local
 from softgrasp.reduction.identify.unknowns import Unknown
 from softgrasp.reduction.online import ReducedTrajectory
-from softgrasp.reduction.system import EnergySystem
 
-RADIUS = 0.7  # of log theta in a round: within a factor of two the basis of the round serves
 ROUNDS = 15
 MOVED, MOVED_NOISE = 0.05, 0.5  # change of log theta, or share of its noise, within which a basis stands
 LATE = 0.1  # of the run: largest time shift between hand and camera
+EDGE = 1e-6  # of log theta: nearer to the end of a range a value lies on it
+NO_RUN = 1e6  # residual of values at which a small model folds, which sends the fit back
 ROBUST = 2.0  # standard deviations from which residuals count less, with `robust`
 
 
@@ -55,13 +56,13 @@ class Nuisances:
 class Misfit:
     """Residuals over sigma and their Jacobian, by the reduced model of a round."""
 
-    def __init__(self, near: Near, experiments: Sequence[Experiment], sigma: Array, nuisances: Nuisances) -> None:
+    def __init__(self, near: Local, experiments: Sequence[Experiment], sigma: Array, nuisances: Nuisances) -> None:
         self.near, self.experiments, self.sigma, self.nuisances = near, experiments, sigma, nuisances
         self.k = len(near.unknowns)
         self.runs = 0  # reduced runs made
-        self._last: tuple[bytes, EnergySystem, list[ReducedTrajectory]] | None = None
+        self._last: tuple[bytes, Any, list[ReducedTrajectory]] | None = None
 
-    def answers(self, p: Array) -> tuple[EnergySystem, list[ReducedTrajectory]]:
+    def answers(self, p: Array) -> tuple[Any, list[ReducedTrajectory]]:
         """System and runs at parameters; those of the last call are kept."""
         key = p[: self.k].tobytes()
         if self._last is None or self._last[0] != key:
@@ -85,10 +86,23 @@ class Misfit:
         """Outputs of all experiments where they were measured, over sigma, (m,)."""
         return np.concatenate([self.measured(i, y, p) for i, y in enumerate(outputs)])
 
+    def bounds(self, bounds: Sequence[Array], p: Array) -> Array:
+        """Largest errors of outputs (steps + 1, outputs) where they were measured, over sigma, (m,)."""
+        weights = [abs(e.weights(self.shift(p, i))) for i, e in enumerate(self.experiments)]
+        pairs = zip(weights, bounds, self.experiments, strict=True)
+        return np.concatenate([((W @ b) / self.sigma)[e.data.seen] for W, b, e in pairs])
+
     def residual(self, p: Array) -> Array:
-        """(W y + c - data) / sigma, (m,)."""
+        """(W y + c - data) / sigma, (m,); large where the small model has no run, so that the fit goes back."""
         _, offsets, _ = self.nuisances.split(p, self.k)
-        answers, parts = self.answers(p)[1], []
+        first = self._last is None
+        try:
+            answers = self.answers(p)[1]
+        except SolverError:
+            if first:
+                raise
+            return np.full(sum(int(e.data.seen.sum()) for e in self.experiments), NO_RUN)
+        parts = []
         for i, e in enumerate(self.experiments):
             known = e.data.values.copy()
             for (at, j), c in zip(self.nuisances.offsets, offsets, strict=True):
@@ -107,7 +121,7 @@ class Misfit:
         theta = np.exp(p[: self.k])
         parts = []
         for i, (e, answer) in enumerate(zip(self.experiments, answers, strict=True)):
-            slopes = self.near.slopes(theta, by, small, answer, e.driven)
+            slopes = self.near.slopes(theta, by, small, answer, e)
             self.runs += len(by)
             parts.append(np.array([self.measured(i, y, p) for y in slopes]).reshape(len(by), -1).T)
         return np.vstack(parts)
@@ -136,16 +150,15 @@ class Fit:
     history: tuple[tuple[float, ...], ...]  # theta at the start and after each round
     runs: int  # reduced runs of all rounds
     unsettled: float  # largest change of log theta in the last of too many rounds; 0 where they converged [1]
+    edges: tuple[str, ...] = ()  # names of the values at the end of the range that the only small model has
 
 
 def fit_rounds(
-    model: Model,
+    make: Callable[[Array], Local],
     experiments: Sequence[Experiment],
-    unknowns: Sequence[Unknown],
     start: Array,
     sigma: Array,
     nuisances: Nuisances,
-    N: int,
     *,
     robust: bool = False,
     progress: Callable[[int], None] = lambda done: None,
@@ -153,27 +166,43 @@ def fit_rounds(
     """Fit in rounds, see the module; Gauss-Newton in a trust region [BCL99]. Collective.
 
     Args:
+        make: gives the small model for values near some (k,).
         start: log theta and nuisances.
         progress: called with the number of rounds done.
 
-    Raises ReductionError: there is no reduced model of N columns.
+    Raises:
+        ReductionError: there is no such small model.
+        SolverError: it has no run at the values of a round.
     """
     from scipy.optimize import least_squares
 
-    k, p, runs = len(unknowns), start, 0
+    k, p, runs = len(start) - nuisances.count, start, 0
     history = [tuple(np.exp(p[:k]).tolist())]
     for rounds in range(1, ROUNDS + 1):
-        misfit = Misfit(Near(model, unknowns, np.exp(p[:k]), N), experiments, sigma, nuisances)
+        near = make(np.exp(p[:k]))
+        misfit = Misfit(near, experiments, sigma, nuisances)
         late = LATE * np.array([experiments[i].scene.time_end for i in nuisances.shifts])
         free = np.full(len(nuisances.offsets), np.inf)
+        low, high = near.limits(p[:k])
+        p = np.concatenate([np.clip(p[:k], low + EDGE / 2, high - EDGE / 2), p[k:]])
         found = least_squares(
             misfit.residual, p, misfit.jacobian, x_scale="jac", xtol=1e-9, ftol=1e-12, gtol=1e-12, max_nfev=50,
-            bounds=(np.concatenate([p[:k] - RADIUS, -free, -late]), np.concatenate([p[:k] + RADIUS, free, late])),
+            bounds=(np.concatenate([low, -free, -late]), np.concatenate([high, free, late])),
             loss="soft_l1" if robust else "linear", f_scale=ROBUST if robust else 1.0,
         )  # fmt: skip
         change, p, runs = found.x - p, found.x, runs + misfit.runs
         history.append(tuple(np.exp(p[:k]).tolist()))
         progress(rounds)
+        if near.whole_range:
+            ends = np.minimum(p[:k] - low, high - p[:k]) < EDGE
+            return Fit(
+                misfit,
+                p,
+                tuple(history),
+                runs,
+                0.0,
+                tuple(near.unknowns[i].name for i in map(int, np.flatnonzero(ends))),
+            )
         _, sizes, directions = np.linalg.svd(apart(found.jac, k), full_matrices=False)
         size = max(1.48 * float(np.median(np.abs(found.fun))), 1.0)  # what is not fitted moves the values as noise does
         if (np.abs(directions @ change[:k]) <= np.maximum(MOVED, MOVED_NOISE * size / np.maximum(sizes, 1e-300))).all():

@@ -3,35 +3,50 @@
     min over theta of sum |W y_N(t; theta) - y|^2 / sigma^2,   J = W dy_N/dlog theta / sigma,   J+ = (J'J)^-1 J'
 
 noise: the roots of diag (J'J)^-1; mesh: J+ W delta(t), delta(t) the estimated error of the outputs over time; time
-step: the same with the difference to half the step; reduction: with the difference to a full run at the answer.
+step: the same with the difference to half the step; reduction: with the difference to a full run at the answer, or
+|J+| b with the bound b of a certified model. Where linear elasticity may be beyond its range, one full run at finite
+strain says what it changes, and where that is more than the noise the fit is made at finite strain.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 
 from softgrasp.fem.accuracy.adapt import build
 from softgrasp.fem.columns import Columns, hand_columns
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem.errors import SceneError, SolverError, shortened
 from softgrasp.fem.model.build import MeshEstimate, Model
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.identify.data import Measurements, check, parse_noise, read_measurements
+from softgrasp.fem.strain.laws import LAWS, LawName
+from softgrasp.reduction.identify.data import Measurements, check, parse_noise, read_measurements, told_apart
 from softgrasp.reduction.identify.fit import Fit, Linearisation, Nuisances, by_experiment, fit_rounds, linearise
-from softgrasp.reduction.identify.near import check_identifiable, experiment
-from softgrasp.reduction.identify.parts import errors_of_outputs, finer_scene, finer_steps, finer_tolerance
+from softgrasp.reduction.identify.near import Experiment, Local, Near, check_identifiable, experiment, moved_as
+from softgrasp.reduction.identify.parts import (
+    OutputErrors,
+    errors_of_outputs,
+    finer_scene,
+    finer_steps,
+    finer_tolerance,
+)
+from softgrasp.reduction.identify.posterior import check_posterior, sample
 from softgrasp.reduction.identify.result import Identified
-from softgrasp.reduction.identify.unknowns import assumed, parse_unknowns, scene_at, value_of
+from softgrasp.reduction.identify.unknowns import Unknown, parse_unknowns, scene_at, value_of
 from softgrasp.reduction.identify.verdict import judge, reasons, unseen, warnings
 
-GROWTH, LARGEST_N = 1.5, 200  # of N while the reduction exceeds the noise
+if TYPE_CHECKING:
+    from softgrasp.reduction.certified.model import CertifiedModel
+
+MORE_ROUNDS = 3  # times that the fit goes on with models that are exact at the values of a round
 MOST_REFINED = 3  # times that a mesh is refined
 Data = Measurements | str | Path
+Law = LawName | Literal["auto", "linear"]
 
 
 def identify(
@@ -45,6 +60,9 @@ def identify(
     shift: bool = False,
     robust: bool = False,
     refine: bool = False,
+    law: Law = "auto",
+    certified: CertifiedModel | str | Path | None = None,
+    posterior: int = 0,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Identified:
     """Values (mu, lambda, ..) = argmin sum |y_N(t) - y|^2 / sigma^2 [BCL99], and their errors by cause. Collective.
@@ -69,25 +87,37 @@ def identify(
         data: CSV file or measurements, or several, an experiment each.
         fit: "mu,lambda,beta" or a sequence; of a layer as "skin.mu".
         noise: standard deviation of each measured number [m, rad], or "tip=1e-3,mid_x=2e-3".
-        N: dimension of the reduced models; grows where the reduction exceeds the noise.
+        N: dimension of the reduced models, the hand's 2 n_s included; full runs correct them where the reduction
+            exceeds the noise.
         offset: fit a constant error of each output too.
         shift: fit a time shift between hand and outputs too.
         robust: a loss in which outliers count little.
         refine: refine the mesh, and the time step, where they exceed the noise.
+        law: "linear" elasticity, or a hyperelastic law by hyper-reduced models; "auto" is that of the scene, and takes
+            "neo-hooke" where finite strain changes a linear value by more than the noise and the data do not object.
+        certified: a certified model of the scene, or its file: its basis serves for all values, its bound is the part
+            of the reduction. Linear elasticity alone.
+        posterior: samples of the posterior by emcee, which check the covariance; 0: none.
         progress: called with the number of rounds done.
 
     Raises:
         SceneError: data or scene cannot be fitted, in one sentence.
         SolverError: a solve fails.
     """
+    if any(m.part for m in model.system.materials):
+        raise SceneError("identify fits lambda, mu, rho and beta, and cannot go with tissue.energy or own terms yet")
     check_identifiable(model)
+    if posterior:
+        check_posterior(posterior)
+    if law not in ("auto", "linear", *LAWS):
+        raise SceneError(f"--law {shortened(str(law))}: it must be auto, linear, {', '.join(LAWS)}")
     columns = tuple(c for o in model.outputs for c in o.columns)
     sigma = parse_noise(noise if isinstance(noise, str) else repr(float(noise)), columns)
     names = [part.strip() for part in fit.split(",") if part.strip()] if isinstance(fit, str) else list(fit)
     many = [data] if isinstance(data, Measurements | str | Path) else list(data)
     if not many:
         raise SceneError("identify: there are no measurements; give at least one file")
-    read = tuple(_measurements(model, each) for each in many)
+    read = told_apart([_measurements(model, each) for each in many])
     done = 0
 
     def tick(_: int) -> None:
@@ -95,14 +125,32 @@ def identify(
         done += 1
         progress(done)
 
-    answer = _identify(model, read, names, sigma, N, offset, shift, robust, tick)
+    asked = Asked(read, names, sigma, N, offset, shift, robust, law, certified, tick, posterior)
+    answer = _identify(model, asked)
     for _ in range(MOST_REFINED if refine else 0):
         if (finer := refinement(answer)) is None:
             break
-        answer = _identify(
-            build(finer, comm=model.system.layout.comm), read, names, sigma, N, offset, shift, robust, tick
-        )
+        if certified is not None:
+            raise SceneError("--refine: a certified model is of one mesh; refine the scene and reduce it again")
+        answer = _identify(build(finer, comm=model.system.layout.comm), asked)
     return answer
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of a model."""
+
+    data: tuple[Measurements, ...]  # an experiment each
+    names: Sequence[str]  # of what is fitted
+    sigma: Array  # standard deviation of the noise of each output, (p,) [m, rad]
+    N: int  # dimension of the reduced models
+    offset: bool  # whether a constant error of each output is fitted too
+    shift: bool  # whether a time shift is
+    robust: bool  # whether outliers count little
+    law: Law  # of the material
+    certified: CertifiedModel | str | Path | None  # model of the scene that is used instead of others
+    tick: Callable[[int], None]  # called after each round
+    posterior: int = 0  # samples of the posterior
 
 
 def _measurements(model: Model, data: Data) -> Measurements:
@@ -116,77 +164,156 @@ def _measurements(model: Model, data: Data) -> Measurements:
             )
         if data.hand is not None and not (np.isfinite(data.hand[0]).all() and np.isfinite(data.hand[1]).all()):
             raise SceneError(f"{data.name}: the measured hand is not finite; give finite positions")
-        check(data.name, data, end if data.hand is None else float(data.hand[0][-1]), layout.extent)
+        check(data.name, data, end if data.hand is None else float(data.hand[0][-1]), layout.extent, columns)
         return data
     hand = hand_columns(layout.n_s, layout.dimension, "q")
     return on_root(layout.comm, lambda: read_measurements(Path(data), columns, hand, end, layout.extent))
 
 
-def _identify(
-    model: Model, data: tuple[Measurements, ...], names: Sequence[str], sigma: Array, N: int,
-    offset: bool, shift: bool, robust: bool, tick: Callable[[int], None],
-) -> Identified:  # fmt: skip
-    unknowns = parse_unknowns(names, model)
-    k, comm = len(unknowns), model.system.layout.comm
+def _identify(model: Model, asked: Asked) -> Identified:
+    """The answer on the mesh of a model. Collective."""
+    own = model.scene.effects.finite_strain
+    if asked.law == "linear" and own is not None:
+        raise SceneError(f"--law linear: scene '{model.scene.name}' has effects.finite_strain; set it to false")
+    if asked.law not in ("auto", "linear") and (own is None or own.law != asked.law):
+        from softgrasp.reduction.identify.strained import strained_model  # linear fits do not pay for it
+
+        model = strained_model(model, cast(LawName, asked.law))
+    unknowns, comm = parse_unknowns(asked.names, model), model.system.layout.comm
     first = np.array([value_of(model.system.materials, u) for u in unknowns])
     with tempfile.TemporaryDirectory() as folder:
-        own = Path(comm.bcast(folder))
-        experiments = [experiment(model, each, own / f"hand-{i}.csv") for i, each in enumerate(data)]
-        nuisances = Nuisances.of(experiments, offset, shift)
+        place = Path(comm.bcast(folder))
+        experiments = [experiment(model, each, place / f"hand-{i}.csv") for i, each in enumerate(asked.data)]
+        nuisances = Nuisances.of(experiments, asked.offset, asked.shift)
         start = np.concatenate([np.log(first), np.zeros(nuisances.count)])
-        while True:
-            found = fit_rounds(model, experiments, unknowns, start, sigma, nuisances, N, robust=robust, progress=tick)
-            line = linearise(found.misfit, found.p, robust)
-            reduced = found.misfit.answers(found.p)[1]
-            errors, estimate = errors_of_outputs(found.misfit.near, np.exp(found.p[:k]), reduced, experiments)
-            parts = {
-                name: None if error is None else line.inverse @ found.misfit.together(error, found.p)
-                for name, error in errors.items()
-            }
-            most = min(LARGEST_N, model.states)
-            lost, noise = parts["reduction"], np.sqrt(np.diag(line.covariance))
-            if found.unsettled or lost is None or (np.abs(lost) <= noise).all() or most < N * GROWTH:
-                break
-            N, start = 2 * int(np.ceil(N * GROWTH / 2)), found.p  # modes come in pairs of states
-    return _answer(found, line, first, parts, estimate, N, robust)
+        solved = _solve(model, unknowns, experiments, nuisances, start, asked)
+        return _within_range(_answer(solved, first, asked), solved, first, asked)
 
 
-def _answer(
-    found: Fit, line: Linearisation, start: Array, parts: dict[str, Array | None], estimate: MeshEstimate | None,
-    N: int, robust: bool,
-) -> Identified:  # fmt: skip
-    misfit = found.misfit
+@dataclass(frozen=True)
+class Solved:
+    """A fit with its errors."""
+
+    fit: Fit  # where the rounds end
+    line: Linearisation  # around there
+    errors: OutputErrors  # of the outputs there
+    law: str  # "linear", or the hyperelastic law
+
+
+def _solve(
+    model: Model,
+    unknowns: Sequence[Unknown],
+    experiments: Sequence[Experiment],
+    nuisances: Nuisances,
+    start: Array,
+    asked: Asked,
+) -> Solved:
+    """Fit with small models, which full runs correct while the reduction exceeds the noise. Collective."""
+    k, strain, again = len(unknowns), model.scene.effects.finite_strain, 0
+    while True:
+        make = _small_models(model, unknowns, experiments, asked, exact=again > 0)
+        found = fit_rounds(make, experiments, start, asked.sigma, nuisances, robust=asked.robust, progress=asked.tick)
+        line, theta = linearise(found.misfit, found.p, asked.robust), np.exp(found.p[:k])
+        errors = errors_of_outputs(found.misfit.near, theta, found.misfit.answers(found.p)[1], experiments)
+        lost, noise = errors.of_values(found.misfit, line, found.p)["reduction"], np.sqrt(np.diag(line.covariance))
+        done = found.unsettled or found.misfit.near.whole_range or lost is None or (np.abs(lost) <= noise).all()
+        if done or again == MORE_ROUNDS:
+            return Solved(found, line, errors, "linear" if strain is None else strain.law)
+        start, again = found.p, again + 1
+
+
+def _small_models(
+    model: Model, unknowns: Sequence[Unknown], experiments: Sequence[Experiment], asked: Asked, exact: bool
+) -> Callable[[Array], Local]:
+    """What makes a small model near values. Raises SceneError: there is none. Collective.
+
+    ``exact``: correct a linear one by full runs at the values.
+    """
+    if model.system.points is not None:
+        from softgrasp.reduction.identify.strained import Strained, check_strained
+
+        if asked.certified is not None:
+            raise SceneError(
+                "--certified: its bound is of linear elasticity; leave out effects.finite_strain and --law"
+            )
+        check_strained(model, unknowns, experiments)
+        return lambda values: Strained(model, unknowns, values, asked.N, experiments)
+    if asked.certified is not None:
+        from softgrasp.reduction.identify.boxed import Boxed, load_for
+
+        certified = load_for(model, asked.certified)
+        return lambda values: Boxed(model, unknowns, certified)
+    return lambda values: Near(model, unknowns, values, asked.N, experiments, exact)
+
+
+def _within_range(answer: Identified, solved: Solved, first: Array, asked: Asked) -> Identified:
+    """A linear answer with what finite strain changes, or the answer at finite strain in its place. Collective."""
+    if solved.law != "linear":
+        return answer
+    from softgrasp.reduction.identify import beyond
+    from softgrasp.reduction.identify.strained import strained_model
+
+    fit, unknowns = solved.fit, answer.unknowns
+    scale = beyond.linear_range(fit.misfit, fit.p)
+    if not scale.left:
+        return answer
+    if asked.law == "linear" or beyond.not_yet(answer):
+        hint = "identify tests finite strain once the answer stands" if asked.law == "auto" else "--law auto tests it"
+        return replace(answer, warnings=(*answer.warnings, scale.sentence(hint)))
+    try:
+        part = beyond.strain_part(fit.misfit, solved.line, fit.p, solved.errors, unknowns, beyond.DEFAULT)
+    except (SceneError, SolverError) as error:
+        return replace(answer, warnings=(*answer.warnings, scale.sentence(f"it is not tried: {error}")))
+    known = beyond.with_part(answer, part)
+    if (np.abs(part) <= answer.noise).all() and answer.residuals.misfit <= answer.residuals.limit:
+        return known
+    model = strained_model(fit.misfit.near.model, beyond.DEFAULT)
+    experiments = [replace(e, scene=moved_as(model.scene, e)) for e in fit.misfit.experiments]
+    try:
+        other = _solve(model, unknowns, experiments, fit.misfit.nuisances, fit.p, replace(asked, certified=None))
+    except (SceneError, SolverError) as error:
+        return beyond.refused(known, part, str(error))
+    return beyond.chosen(answer, _answer(other, first, asked), part)
+
+
+def _answer(solved: Solved, start: Array, asked: Asked) -> Identified:
+    """What a fit answers."""
+    found, line, misfit, robust = solved.fit, solved.line, solved.fit.misfit, asked.robust
     k, unknowns, data = misfit.k, tuple(misfit.near.unknowns), tuple(e.data for e in misfit.experiments)
     values, noise = np.exp(found.p[:k]), np.sqrt(np.diag(line.covariance))
-    model = misfit.near.full(values)
+    parts, kinds = solved.errors.of_values(misfit, line, found.p), solved.errors.kinds(solved.law)
+    model, estimate = misfit.near.full(values), solved.errors.estimate
     tables = list(by_experiment(misfit, line.residual))
     judged = judge(line.residual, tables, len(found.p), robust)
     columns = tuple(c for o in model.outputs for c in o.columns)
     scene = scene_at(model.scene, unknowns, values)
+    own, comm = None if misfit.near.whole_range else misfit.near.size, model.system.layout.comm
+    sampled = None
+    if asked.posterior:
+        sampled = on_root(comm, lambda: sample(misfit, found.p, line.all_deviations, asked.posterior, robust))
     return Identified(
-        unknowns=unknowns, start=start, values=values, noise=noise, parts=parts, covariance=line.covariance,
-        sight=line.sizes, directions=line.directions,
-        assumed={
-            u.name: -line.inverse @ misfit.slopes(found.p, [u])[:, 0] for u in assumed(model, unknowns)
-        },
+        unknowns=unknowns, start=start, values=values, noise=noise, parts=parts, kinds=kinds, law=solved.law,
+        covariance=line.covariance, sight=line.sizes, directions=line.directions,
+        assumed={u.name: -line.inverse @ misfit.slopes(found.p, [u])[:, 0] for u in misfit.near.rests_on()},
         nuisances=_nuisances(misfit.nuisances, found.p[k:], line.all_deviations[k:], data, columns),
         residuals=judged,
         reasons=reasons(unknowns, judged, found.unsettled, unseen(unknowns, line.sizes, line.directions), noise,
-            parts, _cures(parts, noise, estimate, model.scene, N)),
+            parts, _cures(parts, noise, estimate, model.scene, own), found.edges),
         warnings=warnings(judged, robust),
-        history=found.history, runs=found.runs, N=N, scene=scene,
+        history=found.history, runs=found.runs, N=misfit.near.size, scene=scene,
         model=replace(model, scene=scene, accuracy=estimate), estimate=estimate, data=data,
         fitted=tuple(e.values + misfit.sigma * r for e, r in zip(data, tables, strict=True)),
-        sigma=misfit.sigma, columns=columns,
+        sigma=misfit.sigma, columns=columns, posterior=sampled,
     )  # fmt: skip
 
 
 def _cures(
-    parts: dict[str, Array | None], noise: Array, estimate: MeshEstimate | None, scene: Scene, N: int
+    parts: dict[str, Array | None], noise: Array, estimate: MeshEstimate | None, scene: Scene, N: int | None
 ) -> dict[str, str]:
-    """What mends each part that exceeds the noise."""
+    """What mends each part that exceeds the noise; ``N`` of the reduced models, None of a certified one."""
     mesh, step = parts["mesh"], parts["time step"]
-    result = {"reduction": f"take more than N = {N} columns"}
+    certified = "reduce the scene with a smaller --tolerance, or leave the certified model out"
+    result = {"reduction": certified if N is None else f"take more than N = {N} columns"}
     if mesh is not None and estimate is not None:
         tolerance = finer_tolerance(mesh, noise, estimate)
         result["mesh"] = f"set tissue.order = 2 and tissue.refine.tolerance = {tolerance:g}, or take --refine"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,8 +14,12 @@ from softgrasp.fem.model.build import MeshEstimate
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.identify.near import Experiment, Near
+from softgrasp.reduction.identify.fit import Linearisation, Misfit
+from softgrasp.reduction.identify.near import Experiment, Local, same_motion
 from softgrasp.reduction.online import ReducedTrajectory
+
+if TYPE_CHECKING:
+    from softgrasp.reduction.certified.certificate import Bound
 
 STEP_SHARE = 4 / 3  # error of a midpoint step over its difference to half the step
 MARGIN = 0.5  # of what the error of mesh or step may be to stay below the noise
@@ -23,23 +27,54 @@ LARGE = 0.1  # error of the outputs above which parts of the error are no small 
 COARSEST, FINEST = 1e-2, 1e-5  # tolerances that a refinement can take
 
 
-def errors_of_outputs(
-    near: Near, values: Array, answers: Sequence[ReducedTrajectory], experiments: Sequence[Experiment]
-) -> tuple[dict[str, list[Array] | None], MeshEstimate | None]:
-    """Truth less reduced outputs of each experiment by cause, (steps + 1, outputs), and the estimate. Collective.
+@dataclass(frozen=True)
+class OutputErrors:
+    """Errors of the reduced outputs of each experiment over time, (steps + 1, outputs) each [m, rad]."""
 
-    The part of the reduction is measured by a full run at the values, those of mesh and time step are estimates; that
-    of the mesh is None where there is none.
+    signed: dict[str, list[Array] | None]  # truth less reduced outputs by cause; None where it is not known
+    bounds: list[Bound] | None  # of the reduction, instead of its signed error
+    estimate: MeshEstimate | None  # that of the mesh, of the first experiment; None where there is none
+
+    def of_values(self, misfit: Misfit, line: Linearisation, p: Array) -> dict[str, Array | None]:
+        """Relative error of the values by cause, (k,), None where it is not known: J+ delta, or at most |J+| bound."""
+        parts = {
+            name: None if error is None else line.inverse @ misfit.together(error, p)
+            for name, error in self.signed.items()
+        }
+        if self.bounds is not None:
+            parts["reduction"] = np.abs(line.inverse) @ misfit.bounds([b.values for b in self.bounds], p)
+        return parts
+
+    def kinds(self, law: str) -> dict[str, str]:
+        """How each is known, in words."""
+        linear = "" if law == "linear" else " by linear elasticity at the values"
+        known = "measured by a full run"
+        if self.bounds is not None:
+            known = "proved, at most" if all(b.kind == "proof" for b in self.bounds) else "at most, estimated"
+        return {"mesh": f"estimated{linear}", "time step": "estimated", "reduction": known}
+
+
+def errors_of_outputs(
+    near: Local, values: Array, answers: Sequence[ReducedTrajectory], experiments: Sequence[Experiment]
+) -> OutputErrors:
+    """Those at some values, and the estimate of the mesh. Collective.
+
+    The part of the reduction is measured by a full run at the values or bounded by a certificate, those of mesh and
+    time step are estimates; that of the mesh is None where there is none.
     """
     full, small = near.full(values), near.system(values)
     estimates: dict[int, MeshEstimate] = {}
     runs: dict[int, Array] = {}
     found: dict[str, list[Array] | None] = {"mesh": [], "time step": [], "reduction": []}
+    bounds: list[Bound] = []
     for i, (e, answer) in enumerate(zip(experiments, answers, strict=True)):
-        same = i if e.data.hand is not None else -1  # all others have the motion of the scene
-        if same not in runs:
-            model = replace(full, scene=e.scene)
+        same = same_motion(i, e)
+        model, bound = replace(full, scene=e.scene), near.bound(values, e)
+        if bound is not None:
+            bounds.append(bound)
+        elif same not in runs:
             runs[same] = simulate(model).outputs
+        if same not in estimates:
             try:
                 estimates[same] = estimated(model)
             except (SceneError, MeshError, ResourceError):  # no finer mesh can be made
@@ -48,12 +83,14 @@ def errors_of_outputs(
         for name, part in (
             ("mesh", estimates[same].delta if same in estimates else None),
             ("time step", STEP_SHARE * (halved - answer.outputs)),
-            ("reduction", runs[same] - answer.outputs),
+            ("reduction", None if same not in runs else runs[same] - answer.outputs),
         ):
             kept = found[name]
             if kept is not None and part is not None:
                 kept.append(part)
-    return found, next(iter(estimates.values()), None)
+    if bounds:
+        found["reduction"] = None
+    return OutputErrors(found, bounds or None, next(iter(estimates.values()), None))
 
 
 def finer_tolerance(mesh: Array, noise: Array, estimate: MeshEstimate) -> float:

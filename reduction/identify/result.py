@@ -12,6 +12,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.shown import Card, Shown, percent
 from softgrasp.reduction.identify.data import Measurements
+from softgrasp.reduction.identify.posterior import Posterior
 from softgrasp.reduction.identify.unknowns import Unknown
 from softgrasp.reduction.identify.verdict import Residuals
 
@@ -29,10 +30,15 @@ class Identified(Shown):
     noise: Array
     """Standard deviation of each value by the noise, relative [1], (k,)."""
     parts: dict[str, Array | None]
-    """Estimated relative error (k,) [1] of the values by "mesh", "time step" and "reduction", signed.
+    """Estimated relative error (k,) [1] of the values by "mesh", "time step", "reduction", "linear elasticity", signed.
 
-    What each makes of value / truth - 1; None where it is not known.
+    What each makes of value / truth - 1, the proof of a certified model without a sign; None where it is not known.
+    Linear elasticity is named where finite strain changes more than nothing, and values are linear all the same.
     """
+    kinds: dict[str, str]
+    """How each part of the error is known, in words, by its name."""
+    law: str
+    """Law of the material, "linear" or the name of a hyperelastic one."""
     covariance: Array
     """Covariance of log(values) by the noise, (k, k) [1]."""
     sight: Array
@@ -54,7 +60,7 @@ class Identified(Shown):
     runs: int
     """Number of reduced runs [1]."""
     N: int
-    """Dimension of the reduced models."""
+    """Dimension of the reduced models, the hand's 2 n_s included."""
     scene: Scene
     """The scene with the values."""
     model: Model
@@ -69,6 +75,8 @@ class Identified(Shown):
     """Standard deviation of the noise of each output, (outputs,) [m, rad]."""
     columns: Columns
     """Name, axis and unit of each output."""
+    posterior: Posterior | None = None
+    """Samples of the posterior, which check the covariance; None where none were asked for."""
 
     @property
     def correlation(self) -> Array:

@@ -93,7 +93,7 @@ def materials_at(
     result = list(materials)
     for u, value in zip(unknowns, values, strict=True):
         for i in u.layers:
-            result[i] = replace(result[i], **{KINDS[u.kind]: float(value)})
+            result[i] = replace(result[i], **dict[str, Any]({KINDS[u.kind]: float(value)}))
     return tuple(result)
 
 

@@ -79,6 +79,7 @@ def reasons(
     noise: Array,
     parts: dict[str, Array | None],
     cures: dict[str, str],
+    edges: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Why an answer is refused, a sentence each.
 
@@ -87,6 +88,7 @@ def reasons(
         noise: part of the noise in each value, relative.
         parts: that of mesh, time step and reduction, None where it is not known.
         cures: what mends each.
+        edges: names of the values that end where the range of the only small model does.
     """
     found = []
     if residuals.misfit > residuals.limit:
@@ -99,6 +101,10 @@ def reasons(
             f"The fit does not converge: a value still changes by {percent(unsettled)} in the last round; start nearer "
             "to the answer, fit other parameters, or state a larger noise."
         )
+    found += [
+        f"{name} ends at the end of the box of the certified model: train a wider one, or leave it out."
+        for name in edges
+    ]
     found += [f"The data do not see {words}: fit fewer parameters, or measure more." for words in invisible]
     for name, part in parts.items():
         if part is None:

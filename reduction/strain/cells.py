@@ -16,7 +16,7 @@ from mpi4py import MPI
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.strain.compiled import LANES
-from softgrasp.fem.strain.laws import LAWS, LawName, Start
+from softgrasp.fem.strain.laws import LAWS, Start
 
 BLOCK = 1 << 20  # entries of H at a time
 
@@ -25,7 +25,7 @@ BLOCK = 1 << 20  # entries of H at a time
 class Cells:
     """Points of some cells in reduced coordinates."""
 
-    law: LawName  # law of the material
+    law: str  # name of the law of the material
     B: Array  # grad z = B_q a, (k, d, d, q)
     weight: Array  # xi vol [m^d], (q,)
     xi: Array  # weight of the point's cell, (q,)

@@ -332,6 +332,11 @@ def train(model: Model, runs: Sequence[FullRun], N: int) -> Training:
     system, points = model.system, model.system.points
     if points is None:
         raise ReductionError("the scene has no effects.finite_strain; softgrasp.reduce makes its linear models")
+    if model.system.energy is not None:
+        raise ReductionError(
+            f"reduced models at finite strain know the built-in laws, not the energy {model.system.energy.law.name}; "
+            "set effects.finite_strain=false for a linear one of its tangent"
+        )
     fulls = tuple(runs)
     if not fulls:
         raise ReductionError("there is no full run to train on; give at least one")
@@ -345,7 +350,7 @@ def train(model: Model, runs: Sequence[FullRun], N: int) -> Training:
     numbers = points.cell - offset
     centres = mesh.geometry.x[cell_nodes(mesh), :d].mean(axis=1)
     ones, B = np.ones(len(points.vol)), np.ascontiguousarray(B)
-    cells = Cells(points.law, B, points.vol, ones, points.layer, numbers, centres[numbers])
+    cells = Cells(points.laws.name, B, points.vol, ones, points.layer, numbers, centres[numbers])
     return Training(model, fulls, Phi, cells, offset, tuple(reference_of(run, Phi) for run in fulls), seconds)
 
 

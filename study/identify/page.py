@@ -10,7 +10,7 @@ import numpy as np
 from softgrasp.fem.columns import labels
 from softgrasp.reduction.identify.result import Identified
 from softgrasp.reduction.identify.verdict import BY_CHANCE, direction_in_words
-from softgrasp.study.report import Section, Share, Table, captioned, listed, percent
+from softgrasp.study.report import Section, Share, Table, captioned, in_words, percent
 from softgrasp.study.shell import Session
 from softgrasp.study.shell.session import Page
 
@@ -37,13 +37,13 @@ def compose(answer: Identified, session: Session, fitted: Path, options: str) ->
     sections = [
         Section("", figures=figures[:1]),
         value_table(answer).section(
-            "Noise: standard deviation. Mesh and time step: estimates; reduction: measured by a full run. Signed parts "
-            "are those of value / truth - 1.",
+            f"Noise: standard deviation. {kinds_sentence(answer)} Signed parts are those of value / truth - 1.",
             terminal=True, figures=figures[1:2],
         ),
         sight_table(answer).section("A deviation above 100 % is no knowledge."),
         *([assumed_table(answer).section(ASSUMED, terminal=True)] if answer.assumed else []),
         *([nuisance_table(answer).section(terminal=True)] if answer.nuisances else []),
+        *([posterior_table(answer).section(posterior_sentence(answer), terminal=True)] if answer.posterior else []),
         Section("Fit", rows=fit_rows(answer), figures=figures[2:], terminal=True),
     ]  # fmt: skip
     return Page(
@@ -51,6 +51,12 @@ def compose(answer: Identified, session: Session, fitted: Path, options: str) ->
         {"values.csv": value_table(answer), "residuals.csv": residual_table(answer)}, [*drawn, fitted], options,
         errors=[error_sentence(answer)], warnings=[*answer.reasons, *answer.warnings],
     )  # fmt: skip
+
+
+def kinds_sentence(answer: Identified) -> str:
+    """How each part is known."""
+    text = "; ".join(f"{name}: {how}" for name, how in answer.kinds.items())
+    return f"{text[0].upper()}{text[1:]}."
 
 
 def value_table(answer: Identified) -> Table:
@@ -65,6 +71,26 @@ def value_table(answer: Identified) -> Table:
         for i, u in enumerate(answer.unknowns)
     ]  # fmt: skip
     return Table(header, rows, "Values and the parts of their errors")
+
+
+def posterior_table(answer: Identified) -> Table:
+    """Deviations by the covariance and by the samples."""
+    found = answer.posterior
+    assert found is not None
+    rows = [
+        (u.name, Share(answer.noise[i]), Share(found.deviations[i]), Share(found.mean[i]))
+        for i, u in enumerate(answer.unknowns)
+    ]
+    return Table(("parameter", "noise by the covariance", "by the samples", "mean less the value"), rows, "Posterior")
+
+
+def posterior_sentence(answer: Identified) -> str:
+    """How many samples there are."""
+    assert answer.posterior is not None
+    return (
+        f"{answer.posterior.count} samples by emcee, {answer.posterior.independent:.0f} of them independent: a check "
+        "of the covariance. Both are of the noise alone."
+    )
 
 
 def sight_table(answer: Identified) -> Table:
@@ -109,12 +135,13 @@ def fit_rows(answer: Identified) -> list[tuple[str, str]]:
         for j in range(i)
     ]
     return [
-        ("numbers", f"{r.count} of {listed(labels(answer.columns))}, in {len(answer.data)} experiment(s)"),
+        ("numbers", f"{r.count} of {in_words(labels(answer.columns))}, in {len(answer.data)} experiment(s)"),
         ("mesh", f"n_e = {answer.model.system.layout.n_e}, {answer.scene.time.steps} time steps, those of fitted.toml"),
         ("misfit", f"{r.misfit:.3g} sigma, by chance at most {r.limit:.3g}"),
         ("white", f"correlation of neighbours {r.lag:+.2g}, probability by chance {max(r.white, 1e-15):.2g}"),
         ("outliers", f"{r.outliers} above 4 sigma"),
         *([("correlation", ", ".join(pairs))] if pairs else []),
+        ("law", answer.law),
         ("work", f"{len(answer.history) - 1} rounds, {answer.runs} reduced runs, N = {answer.N}"),
     ]
 
@@ -127,7 +154,7 @@ def error_sentence(answer: Identified) -> str:
         f"{u.name} = {v:.4g} {u.unit} with an error of about {percent(e)}"
         for u, v, e in zip(answer.unknowns, answer.values, answer.total, strict=True)
     ]
-    return f"The data give {listed(values)}."
+    return f"The data give {in_words(values)}."
 
 
 def summary(answer: Identified) -> list[str]:
@@ -138,7 +165,7 @@ def summary(answer: Identified) -> list[str]:
     sentences = [f"The residuals are {size}, {r.misfit:.3g} sigma, and {white}."]
     rests = [name for name, x in answer.assumed.items() if (np.abs(ASSUMED_ERROR * x) > answer.total).any()]
     if rests:
-        sentences.append(f"The values and their errors hold for {listed(rests)} as in the scene.")
+        sentences.append(f"The values and their errors hold for {in_words(rests)} as in the scene.")
     if not answer.reasons:
         sentences.append("fitted.toml is the scene with these values; simulate, reduce and control take it.")
     return sentences
@@ -157,6 +184,8 @@ def result_of(answer: Identified) -> dict[str, Any]:
             }
             for i, u in enumerate(answer.unknowns)
         },
+        "parts": answer.kinds,
+        "law": answer.law,
         "correlation": answer.correlation,
         "directions": [
             {"deviation": 1 / max(float(s), 1e-300), "of": dict(zip([u.name for u in answer.unknowns], d, strict=True))}
@@ -165,6 +194,7 @@ def result_of(answer: Identified) -> dict[str, Any]:
         "assumed": answer.assumed,
         "beside": [{"name": n, "value": v, "deviation": s} for n, v, s in answer.nuisances],
         "residuals": answer.residuals,
+        "posterior": answer.posterior,
         "history": answer.history,
         "N": answer.N,
         "runs": answer.runs,

@@ -23,12 +23,13 @@ from softgrasp.study.pictures import (
     paper_style,
     save,
 )
+from softgrasp.study.pictures.style import SKY
 
 MOST_EXPERIMENTS, MOST_PAIRS = 3, 6  # that are drawn
 RADII = (1.515, 2.448)  # of ellipses that hold 68 and 95 % of two normal values
 FRAME = 3.2  # half width of the frame of an ellipse, in standard deviations, at least
 WIDEST = 8.0  # at most: parts beyond are cut
-COLOURS = {"mesh": ORANGE, "time step": GREEN, "reduction": PURPLE}
+COLOURS = {"mesh": ORANGE, "time step": GREEN, "reduction": PURPLE, "linear elasticity": SKY}
 
 
 def draw(answer: Identified, out: Path) -> list[Path]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 from rich.console import Console
 from rich.progress import TextColumn
 
 from softgrasp.fem.owned import note
 from softgrasp.fem.scene.file import resolved_toml
-from softgrasp.reduction.identify.identify import identify
+from softgrasp.reduction.identify.identify import Law, identify
 from softgrasp.reduction.identify.result import Identified
 from softgrasp.study.identify.page import compose, result_of
 from softgrasp.study.report.origin import origin
@@ -35,6 +36,9 @@ def run_identify(
     shift: bool = False,
     robust: bool = False,
     refine: bool = False,
+    law: str = "auto",
+    certified: Path | None = None,
+    posterior: int = 0,
     quiet: bool = False,
     pictures: bool = True,
     empty: bool = False,
@@ -47,16 +51,19 @@ def run_identify(
     Raises SoftgraspError: with one sentence.
     """
     session = Session("identify", path, overrides, out, console, quiet, pictures, empty=empty)
-    scene = session.scene(data)
+    scene = session.scene(data if certified is None else [*data, certified])
     model = session.model(scene)
     with session.progress(TextColumn("")) as bar:
         task = bar.add_task("rounds of the fit", total=None)
         answer = identify(
             model, list(data), fit, noise, N=columns, offset=offset, shift=shift, robust=robust, refine=refine,
+            law=cast(Law, law), certified=certified, posterior=posterior,
             progress=lambda done: bar.update(task, description=f"round {done} of the fit"),
         )  # fmt: skip
     result = {"command": "identify", **origin(scene, session.comm.size), **result_of(answer), "time": {}}
-    given = {"fit": fit, "noise": noise, "columns": columns}
+    given = {"fit": fit, "noise": noise, "columns": columns, "law": law}
+    given |= {} if certified is None else {"certified": certified}
+    given |= {"posterior": posterior} if posterior else {}
     flags = {"offset": offset, "shift": shift, "robust": robust, "refine": refine}
     words = "".join(f" {shlex.quote(str(file))}" for file in data)
     words += "".join(f" --{key} {shlex.quote(str(value))}" for key, value in given.items())

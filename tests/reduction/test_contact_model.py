@@ -52,7 +52,7 @@ def test_thirty_columns_repeat_a_motion_they_were_not_made_for() -> None:
     assert np.abs(run.outputs - full.outputs).max() < 2e-3 * np.abs(full.outputs - full.outputs_rigid).max()
 
 
-@pytest.mark.ranks(2)
+@pytest.mark.ranks(3)
 @pytest.mark.parametrize(
     "table",
     [TABLE, "obstacle=[{kind='halfspace', normal=[0.05, 1], offset=-0.09, path={velocity=[0, 0.02]}}]"],

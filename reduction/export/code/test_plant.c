@@ -27,10 +27,7 @@ static double replay(FILE *log, long *ticks, double *tolerance) {
             if (!numbers(log, u, SG_PLANT_INPUTS) || !numbers(log, golden, SG_PLANT_OUTPUTS)) return -1;
             status = sg_plant_tick(&plant, u);
             sg_plant_outputs(&plant, y);
-            for (int i = 0; i < SG_PLANT_OUTPUTS; ++i) {
-                double difference = size(y[i] - golden[i]) / scale[i];
-                if (!(difference <= worst)) worst = difference;
-            }
+            worst = larger(worst, y, golden, scale, SG_PLANT_OUTPUTS);
             ++*ticks;
         } else {
             return -1;
@@ -55,11 +52,9 @@ static int refuses(void) {
 }
 
 int main(int count, char **words) {
-    FILE *log = count == 2 ? fopen(words[1], "r") : NULL;
     long ticks = 0;
-    double tolerance = 0, worst = log ? replay(log, &ticks, &tolerance) : -1;
-    if (log) fclose(log);
-    if (worst < 0) return printf("name the golden.log beside this program; it must be whole\n"), 2;
+    double tolerance = 0, worst = replayed(count, words, replay, &ticks, &tolerance);
+    if (worst < 0) return 2;
     int refused = refuses();
     printf("%ld ticks: largest relative difference of an output %.1e, allowed %.0e; ", ticks, worst, tolerance);
     printf("bad inputs %s\n", refused ? "refused" : "NOT refused");

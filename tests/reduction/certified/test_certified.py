@@ -53,7 +53,7 @@ def holds(bound: np.ndarray, error: np.ndarray, size: float) -> bool:
 # --- residual norms
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 def test_triangles_give_the_norms_of_residuals(comm: MPI.Intracomm) -> None:
     """|T c| against C' W^-1 C on rank-independent smooth columns, for layers that differ."""
     model = build(make_scene({"tissue": {"layers": LAYERS}}, KELVIN_VOIGT), comm=comm)
@@ -130,13 +130,14 @@ def test_triangles_see_residuals_that_a_gram_matrix_loses(comm: MPI.Intracomm) -
     C = np.hstack([G, M @ Phi, K @ Phi])
     gram = C.T @ np.linalg.solve(M, C)
     T = np.hstack(norms.columns("mass", (m,))[:3])
-    for small in (1e-6, 1e-10):
+    # eigh leaves residuals of eps times the largest frequency, some 1e-11 and not the same on every processor
+    for small, rel in ((1e-6, 1e-2), (1e-10, 0.3)):
         # eigenmodes cancel, K phi - omega^2 M phi = 0, but for the part that is put in
         c = np.concatenate([[small, 0.0], -squares, np.ones(4)])
         exact = small * np.sqrt(G[:, 0] @ np.linalg.solve(M, G[:, 0]))
-        assert np.linalg.norm(T @ c) == pytest.approx(exact, rel=1e-2)
+        assert np.linalg.norm(T @ c) == pytest.approx(exact, rel=rel)
     lost = np.sqrt(max(c @ gram @ c, 0.0))
-    assert abs(lost - exact) > exact
+    assert abs(lost - exact) >= exact  # a negative square counts as 0, an error of 100 %
 
 
 # --- runs
@@ -189,7 +190,7 @@ SCENES: dict[str, tuple[dict[str, Any], ...]] = {
 }
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 @pytest.mark.parametrize("name", SCENES)
 def test_the_bound_holds_at_every_step(comm: MPI.Intracomm, name: str) -> None:
     model = build(make_scene(*SCENES[name]), comm=comm)
@@ -228,7 +229,7 @@ def _reconstructible(part: Any, whole: Any) -> Any:
     return replace(part, fine=replace(part.fine, reconstruction=whole.fine.reconstruction))
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 @pytest.mark.parametrize("changes", [(), (KELVIN_VOIGT, TURNING, {"effects": {"gravity": {"g": [0.5, -9.0]}}})])
 def test_the_bound_holds_under_a_force(comm: MPI.Intracomm, changes: tuple[Any, ...]) -> None:
     """One-way the hand is exact; two-way it has an error of its own, which norm and bound take in."""
@@ -362,7 +363,7 @@ def test_refusals(comm: MPI.Intracomm) -> None:
 # --- archive
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 def test_archive(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     model = build(make_scene(KELVIN_VOIGT), comm=comm)
     certified = ritz(model, 4, 9, box=ParameterDomain((30.0, 500.0), (20.0, 500.0)), tolerance=0.5)
@@ -398,7 +399,7 @@ def test_archive(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     assert load_certified(file).k2 == 9
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 @pytest.mark.parametrize("whole", [False, True], ids=["online", "reconstruction"])
 @pytest.mark.parametrize(
     ("part", "changed", "word"),

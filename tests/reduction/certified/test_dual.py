@@ -86,7 +86,7 @@ def test_the_computed_part_is_most_of_the_error(comm: MPI.Intracomm) -> None:
     assert np.abs(left).max() < 0.3 * np.abs(off).max()
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 def test_one_rank_and_all_say_the_same(comm: MPI.Intracomm) -> None:
     (_, mine), (_, theirs) = made(comm, KELVIN_VOIGT), made(MPI.COMM_SELF, KELVIN_VOIGT)
     a, b = (m.run(allow=True).certificate.outputs.values for m in (mine, theirs))

@@ -48,8 +48,9 @@ def call(*words: str | Path) -> tuple[int, str]:
 def test_values_page_and_scene_of_a_fit_that_stands(measured: Path, tmp_path: Path) -> None:
     out = tmp_path / "fit"
     code, said = call(
-        "identify", "paper_forward", measured, "--fit", "mu,beta", "--noise", NOISE, "--out", out, *sets(KEYS)
-    )
+        "identify", "paper_forward", measured, "--fit", "mu,beta", "--noise", NOISE, "--law", "linear", "--out", out,
+        *sets(KEYS),
+    )  # fmt: skip
     assert code == 0, said
     result = json.loads((out / "result.json").read_text())
     mu = result["values"]["mu"]
@@ -76,7 +77,8 @@ def test_other_commands_take_the_fitted_scene(measured: Path, tmp_path: Path) ->
     out = tmp_path / "fit"
     small = ["tissue.cells=[4, 8]", "time.steps=150", "time.end=1.5", "motion.duration=1.5"]
     code, said = call(
-        "identify", "paper_lqr", measured, "--fit", "mu", "--noise", NOISE, "--out", out, "--no-pictures", *sets(small)
+        "identify", "paper_lqr", measured, "--fit", "mu", "--noise", NOISE, "--law", "linear", "--out", out,
+        "--no-pictures", *sets(small),
     )  # fmt: skip
     assert code == 3, said
     assert "The answer is refused; do not use its values." in said

@@ -10,7 +10,7 @@ import pytest
 
 import softgrasp as sg
 from softgrasp.reduction.galerkin import galerkin_system
-from softgrasp.reduction.gradient import sensitivities
+from softgrasp.reduction.gradient.reduced import sensitivities
 from softgrasp.reduction.online import run
 from softgrasp.reduction.system import ModelError
 

@@ -11,50 +11,21 @@ derivatives are exact to rounding, for the cost of about a run whatever their nu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from softgrasp.fem.adjoint.result import Loss, RunGradient
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.reduced import MidpointSteps
-from softgrasp.fem.shown import Shown
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory, run
 from softgrasp.reduction.system import EnergySystem, ModelError
 
-Loss = Callable[[Array], tuple[float, Array]]
-"""J and dJ/dy (steps + 1, p) of outputs y (steps + 1, p) [m]."""
 
-
-@dataclass(frozen=True, repr=False)
-class RunGradient(Shown):
-    """A run and the derivatives of J with respect to all that it depends on."""
-
-    run: ReducedTrajectory
-    """The run that was differentiated."""
-    value: float
-    """J."""
-    lam: Array
-    """dJ/dlambda of every layer, (layers,) [1/Pa]."""
-    mu: Array
-    """dJ/dmu of every layer, (layers,) [1/Pa]."""
-    beta: Array | None
-    """dJ/dbeta of every layer, (layers,) [1/s]; None for a model without damping."""
-    rho: Array | None
-    """dJ/drho of every layer, (layers,) [m3/kg]; None for canonical models, which are not affine in it."""
-    alpha: float | None
-    """dJ/dalpha [s]; None for a model without damping."""
-    start: Array
-    """dJ/dx_0, (N,); of the hand zero where it is prescribed."""
-    force: Array | None
-    """dJ/du of every step, (steps, n_s) [1/N]; None where the hand is prescribed."""
-    hand: tuple[Array, Array] | None
-    """dJ/dq_s and dJ/dv_s, (steps + 1, n_s) each [1/m, s/m]; None where a force moves the hand."""
-
-
-def gradient(
+def reduced_gradient(
     rom: ReducedModel,
     loss: Loss,
     dt: float,
@@ -63,19 +34,10 @@ def gradient(
     hand: tuple[Array, Array] | None = None,
     materials: tuple[LayerMaterial, ...] | None = None,
     x0: Array | None = None,
-) -> RunGradient:
+) -> RunGradient[ReducedTrajectory]:
     """J and its derivatives, dJ/dtheta = sum_n h l_n' (A_theta x_{n+1/2} + f_theta) - l_n' E_theta (x_{n+1} - x_n).
 
     The adjoint l of the implicit midpoint rule [HLW06] is the rule backwards. Online; not collective.
-
-    >>> import numpy as np, softgrasp as sg
-    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
-    >>> run = sg.simulate(model)
-    >>> rom = sg.reduce(model, run, "craig_bampton", N=12)
-    >>> misfit = lambda y: (((y - run.outputs) ** 2).sum() / 2, y - run.outputs)
-    >>> found = sg.gradient(rom, misfit, run.times[1], hand=(run.q_s, run.v_s))
-    >>> found.mu.shape, found.hand[1].shape
-    ((1,), (101, 2))
 
     Args:
         rom: linear reduced model.

@@ -1,0 +1,1 @@
+"""Exact derivatives of runs, reduced or full, behind one name."""

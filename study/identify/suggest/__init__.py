@@ -1,0 +1,1 @@
+"""``softgrasp identify --suggest-markers``: where to measure, before anything is measured."""

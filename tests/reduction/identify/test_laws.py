@@ -1,0 +1,146 @@
+"""Linear elasticity and finite strain: which of them the data get, and what the answer says of it."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+import softgrasp as sg
+from softgrasp.fem.errors import SceneError, SolverError
+from softgrasp.reduction.identify.data import Measurements
+
+pytestmark = pytest.mark.serial
+TRUTH = {"mu": 70.0, "beta": 0.025}
+SQUARE = [
+    "tissue.size=[1.0,1.0]", "contact.sides=['top']", "contact.box=[[0.0,0.9],[1.0,1.0]]", "motion.target=[3.0,0.0]",
+    "motion.duration=1.5", "time.end=3.0", "output.snapshots='none'", "tissue.order=2",
+]  # fmt: skip
+FIT = [*SQUARE, "tissue.refine={tolerance=1e-2}", "time.steps=300", "effects.damping={kind='kelvin-voigt',beta=0.02}"]
+NEO = "effects.finite_strain={law='neo-hooke'}"
+
+
+@cache
+def data(noise: float, law: str = NEO, every: int = 2) -> Measurements:
+    """Measurements of a run on a mesh and with steps finer than those of every fit."""
+    keys = [
+        *SQUARE, "tissue.refine={tolerance=3e-3}", "time.steps=600", "tissue.material.mu=70",
+        "effects.damping={kind='kelvin-voigt',beta=0.025}", *filter(None, [law]),
+    ]  # fmt: skip
+    run = sg.simulate(sg.build("paper_forward", keys))
+    y = run.outputs[::every]
+    return Measurements("tip", run.times[::every], y + np.random.default_rng(0).normal(0, noise, y.shape))
+
+
+@cache
+def model(*keys: str) -> Any:
+    return sg.build("paper_forward", [*FIT, *keys])
+
+
+@cache
+def automatic() -> Any:
+    return sg.identify(model(), data(1e-2), "mu,beta", 1e-2)
+
+
+def errors(found: Any) -> Any:
+    """Values over the truth, less one."""
+    return found.values / [TRUTH[u.name] for u in found.unknowns] - 1
+
+
+def test_data_of_large_strain_get_a_fit_at_finite_strain() -> None:
+    found = automatic()
+    assert found.law == "neo-hooke"
+    assert found.warnings[0].startswith("Linear elasticity is beyond its range: it changes beta by about")
+    assert "finite strain with the law neo-hooke" in found.warnings[0]
+    assert found.reasons == ()
+    assert (np.abs(errors(found)) < 2 * found.total).all()
+    # the model is exact at the values of its round, so that what is left is of second order in the last move
+    assert (np.abs(found.parts["reduction"]) < 0.1 * found.noise).all()
+    assert found.kinds["mesh"] == "estimated by linear elasticity at the values"
+    assert found.scene.effects.finite_strain.law == "neo-hooke"
+    assert found.model.system.points is not None
+    # without gravity and drag a motion depends on stiffness over density alone, at finite strain too, and on beta
+    assert found.assumed["rho"] + found.assumed["lambda"] == pytest.approx([1, 0], abs=1e-3)  # differences of 2e-5
+
+
+@pytest.mark.parametrize("noise", [1e-2, 3e-3])
+def test_a_linear_fit_of_neo_hookean_data_does_not_pass_in_silence(noise: float) -> None:
+    found = sg.identify(model(), data(noise), "mu,beta", noise, law="linear")
+    assert (np.abs(errors(found)) > found.total).any()
+    misfit = any(reason.startswith("The misfit is") for reason in found.reasons)
+    assert misfit == (noise < 1e-2)  # it speaks only where the noise is small,
+    assert any("Linear elasticity has an error of about" in text for text in found.warnings)  # the strain always does
+
+
+def test_linear_data_keep_linear_values_whatever_the_strain() -> None:
+    found = sg.identify(model(), data(1e-2, ""), "mu,beta", 1e-2)
+    assert found.law == "linear"
+    assert found.warnings[-1].startswith("Finite strain (neo-hooke) matters at these strains, and fits worse")
+    assert "linear elasticity" not in found.parts
+    assert (np.abs(errors(found)) < 2 * found.total).all()
+
+
+def test_finite_strain_that_the_noise_hides_is_a_part_of_the_error() -> None:
+    found = sg.identify(model(), data(3e-2), "mu,beta", 3e-2)
+    assert (found.law, found.reasons) == ("linear", ())
+    part, truth = found.parts["linear elasticity"], automatic()
+    assert (np.abs(part) < found.noise).all()
+    # what the linear fit of little noise differs by from that at finite strain, up to its own misfit
+    linear = sg.identify(model(), data(1e-2), "mu,beta", 1e-2, law="linear")
+    assert part == pytest.approx(np.log(linear.values / truth.values), abs=0.02)  # 4 % of beta is the largest
+
+
+def test_small_strain_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("softgrasp.reduction.identify.beyond.strain_part", None)
+    small = model("motion.target=[0.003,0.0]")
+    run = sg.simulate(small)
+    y = run.outputs + np.random.default_rng(0).normal(0, 1e-5, run.outputs.shape)
+    found = sg.identify(small, Measurements("tip", run.times, y), "mu", 1e-5)
+    assert (found.law, found.warnings, set(found.parts)) == ("linear", (), {"mesh", "time step", "reduction"})
+
+
+def test_a_fit_at_finite_strain_that_fails_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any) -> None:
+        raise SolverError("the body folds")
+
+    monkeypatch.setattr("softgrasp.reduction.identify.strained.Strained._around", fails)
+    found = sg.identify(model(), data(1e-2), "mu,beta", 1e-2)
+    assert found.law == "linear"
+    assert found.reasons[-1].endswith("and the fit at finite strain fails: the body folds")
+
+
+def test_a_scene_at_finite_strain_is_fitted_with_its_law_gravity_and_two_motions() -> None:
+    keys = [
+        "effects.gravity={g=[0.0,-1.0]}",
+        "time.start='equilibrium'",
+        "effects.finite_strain={law='neo-hooke-quadratic'}",
+    ]
+    coarse = [*SQUARE, "tissue.cells=[4,4]", "time.steps=100", "effects.damping={kind='kelvin-voigt',beta=0.02}", *keys]
+    true = sg.build("paper_forward", [*coarse, "tissue.material.mu=58"])
+    run = sg.simulate(true)
+    other = sg.simulate(sg.build("paper_forward", [*coarse, "tissue.material.mu=58", "motion.target=[-1.0,2.0]"]))
+    rng = np.random.default_rng(3)
+    both = [
+        Measurements("scene", run.times, run.outputs + rng.normal(0, 1e-2, run.outputs.shape)),
+        Measurements("hand", run.times, other.outputs + rng.normal(0, 1e-2, run.outputs.shape), (run.times, other.q_s)),
+    ]
+    found = sg.identify(sg.build("paper_forward", coarse), both, "mu", 1e-2, N=20)
+    assert found.law == "neo-hooke-quadratic"
+    assert abs(found.values[0] / 58 - 1) < 4 * found.noise[0]  # deviations; the mesh is that of the data
+    assert found.residuals.misfit < found.residuals.limit
+    with pytest.raises(SceneError, match="at finite strain identify fits mu, lambda and beta"):
+        sg.identify(true, both, "rho", 1e-2)
+
+
+def test_what_does_not_go_with_finite_strain_is_refused_in_a_sentence() -> None:
+    pushed = sg.build("paper_forward", ["tissue.cells=[4,8]", "time.steps=100", "motion.drive='force'"])
+    run = sg.simulate(pushed)
+    measured = Measurements("tip", run.times, run.outputs)
+    with pytest.raises(SceneError, match="needs the motion of the hand, and a force moves it"):
+        sg.identify(pushed, measured, "mu", 1e-2, law="neo-hooke")
+    turned = sg.build("block_3d", ["tissue.order=1", "tissue.refine={grading='off'}", "time.steps=20"])
+    y = sg.simulate(turned).outputs
+    with pytest.raises(SceneError, match=r"effects\.rotation does not go with finite strain"):
+        sg.identify(turned, Measurements("tip", 0.05 * np.arange(21), y), "mu", 1e-2, law="neo-hooke")
