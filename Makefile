@@ -7,7 +7,7 @@ BIN := .venv/bin
 STAMP := .venv/.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo paper_forward paper_accurate test test-all check lint bench hardcases paper pictures docs docs-serve clean
+.PHONY: help env demo paper_forward paper_accurate test test-one test-all check lint bench hardcases paper pictures docs docs-serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -34,14 +34,17 @@ check: lint ## what to run before a commit: lint, types of what changed, the tes
 	$(BIN)/python -m pytest -q tests/test_project.py
 
 # More ranks than cores: a rank that waits gives its core away (MPICH; without it this part took twice as long).
-test test-all: export MPIR_CVAR_CH4_PROGRESS_THROTTLE = 1
-test: lint ## lint, all tests on one rank, those marked `ranks` on 2 and 3
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
-	$(BIN)/mpiexec -n 2 $(BIN)/python -m pytest -q -m "ranks and not slow"
-	$(BIN)/mpiexec -n 3 $(BIN)/python -m pytest -q
+test test-one test-all: export MPIR_CVAR_CH4_PROGRESS_THROTTLE = 1
+test: $(STAMP) ## lint, all tests on one rank, those marked `ranks(2)` on 2, those marked `ranks` on 3
+	@$(MAKE) --no-print-directory -j2 lint test-one
+	$(BIN)/mpiexec -n 2 $(BIN)/python -m pytest -q --own-ranks
+	$(BIN)/mpiexec -n 3 $(BIN)/python -m pytest -q --own-ranks
 
-test-all: test ## the same, and on 2 ranks the tests without the mark too (nightly)
-	$(BIN)/mpiexec -n 2 $(BIN)/python -m pytest -q -m "not ranks and not slow"
+test-one: $(STAMP)
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+test-all: test ## the same, and everything else that runs on 2 ranks (nightly)
+	$(BIN)/mpiexec -n 2 $(BIN)/python -m pytest -q
 
 bench: $(STAMP) ## print the table of costs of the forward run
 	$(BIN)/python -m benchmarks forward

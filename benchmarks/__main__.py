@@ -1,4 +1,4 @@
-"""``python -m benchmarks forward | riccati | meshes | accuracy | certified | outputs | figures | solvers | scale``."""
+"""``python -m benchmarks accuracy | certified | figures | forward | meshes | outputs | riccati | scale | seeds``."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ from benchmarks import (
     riccati,
     scale,
     scale_rows,
+    seeds,
     solvers,
 )
 from softgrasp.study.shell.ending import run_command
 
 COMMANDS = {
     "forward": forward, "riccati": riccati, "meshes": meshes, "accuracy": accuracy, "certified": certified,
-    "outputs": outputs, "figures": figures, "solvers": solvers, "scale": scale,
+    "outputs": outputs, "seeds": seeds, "figures": figures, "solvers": solvers, "scale": scale,
 }  # fmt: skip
 WORKERS: dict[str, Callable[..., Iterable[Any]]] = {
     "forward": forward_rows.measure_row, "riccati": riccati.measure_row, "scale": scale_rows.measure_row,

@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from benchmarks import driver
 from benchmarks.driver import Goal, cpu_seconds
-from softgrasp import package_version
+from softgrasp import __version__
 from softgrasp.fem import _stack as _stack  # threads and MPI before anything numerical
 from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.model.build import Model, Stopwatch, build
@@ -50,30 +50,30 @@ keep the machine quiet."""
 class MeshPoint:
     """One mesh: unknowns; seconds of mesh and assembly, of factor and steps, of a reduced run, of P; errors."""
 
-    mesh: str
-    n_e: int
-    time_build: float
-    time_run: float
-    error: float
-    time_reduced: float
-    error_reduced: float
-    time_riccati: float
-    error_cost: float
-    solves: int
-    residual: float
+    mesh: str  # mesh and element order in words
+    n_e: int  # number of tissue unknowns
+    time_build: float  # processor time of mesh and assembly [s]
+    time_run: float  # processor time of factor and steps [s]
+    error: float  # error of the deformation [1]
+    time_reduced: float  # processor time of a reduced run [s]
+    error_reduced: float  # error of the deformation of the reduced run [1]
+    time_riccati: float  # wall time of the Riccati solution [s]
+    error_cost: float  # relative error of the optimal cost [1]
+    solves: int  # number of solves of the Riccati solution
+    residual: float  # relative residual of the Riccati solution [1]
 
 
 @dataclass(frozen=True)
 class TolerancePoint:
     """One tolerance: mesh, estimate and bound over the true error, error of the corrected outputs over it; seconds."""
 
-    tolerance: float
-    n_e: int
-    passes: int
-    error: float
-    estimate: float
-    bound: float
-    corrected: float
+    tolerance: float  # tolerance of [tissue.refine] [1]
+    n_e: int  # number of tissue unknowns
+    passes: int  # number of passes of refinement
+    error: float  # true error of the deformation [1]
+    estimate: float  # estimated over true error [1]
+    bound: float  # bound over true error [1]
+    corrected: float  # error of the corrected outputs over that of the outputs [1]
     time_run: float  # a-priori mesh, assembly and run
     time_all: float  # processor time of run, estimate and further passes [s]
 
@@ -201,6 +201,6 @@ def main(
         console.print(part.terminal())
     aims = goals(rows, reached)
     driver.show_goals(console, aims)
-    content |= {"goals": driver.goal_rows(aims), "version": package_version(), "machine": machine()}
+    content |= {"goals": driver.goal_rows(aims), "version": __version__, "machine": machine()}
     markdown = f"{table.markdown()}\n{tolerances.markdown()}"
     list_files(console, driver.write_bench(out, "accuracy", content, table, markdown))

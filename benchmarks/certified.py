@@ -36,8 +36,8 @@ COLUMNS = {
     "answer": "answer",
     "CPU ms": "ms 3",
     "without the proof": "plain 3",
-    "share of the proof": "share .0%",
-    "proof / state space": "of_stepped .0%",
+    "share of the proof": "share %",
+    "proof / state space": "of_stepped %",
     "of a full run": "of_full 3",
 }
 HELP = f"""Certified answers of the paper's scene with Kelvin-Voigt damping, {K} modes certified by {K2}.
@@ -54,7 +54,7 @@ class AnswerCost:
     """One way to an answer on one mesh; None where a number does not apply."""
 
     cells: int  # cells of the short side
-    answer: str
+    answer: str  # kind of the answer in words
     ms: float  # CPU time
     plain: float | None = None  # CPU time without the proof [ms]
     share: float | None = None  # share of the proof in the time of an answer

@@ -33,7 +33,7 @@ class Failure:
     """A row without numbers."""
 
     label: str  # name of the measurement
-    ranks: int
+    ranks: int  # number of ranks
     error: str  # why there is nothing
 
 
@@ -83,9 +83,9 @@ def of[P](kind: type[P], rows: Sequence[Any]) -> list[P]:
 class Goal:
     """A number to reach: ``value <= limit``."""
 
-    text: str
-    value: float
-    limit: float
+    text: str  # meaning of the number
+    value: float  # measured number
+    limit: float  # largest number that reaches the goal
 
     @property
     def ok(self) -> bool:

@@ -66,7 +66,7 @@ class Figure:
     """A figure of one or two numbers."""
 
     text: str  # meaning of the numbers, with {} for each
-    numbers: tuple[Number, ...]
+    numbers: tuple[Number, ...]  # numbers in the order of the text
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Command:
 
     name: str  # argument of --only
     line: str  # command line without --out
-    figures: tuple[Figure, ...]
+    figures: tuple[Figure, ...]  # figures read from its results
     file: str = "result.json"  # file of the numbers, relative to the folder of results
 
     def arguments(self, out: Path) -> list[str]:

@@ -37,9 +37,9 @@ PEER_SHARE = 3  # SciPy and pyMOR need about so many times longer a step
 class WholeRun:
     """The paper's run from the assembled model on, factor included."""
 
-    steps: int
+    steps: int  # number of time steps
     seconds: dict[str, float]  # by method, medians
-    samples: dict[str, list[float]]
+    samples: dict[str, list[float]]  # seconds of each repeat, by method
     drift: float  # of the energy, the largest
 
 
@@ -47,28 +47,28 @@ class WholeRun:
 class ForwardCost:
     """One mesh on so many ranks; what a large run leaves out is empty."""
 
-    problem: str
-    large: bool
-    dimension: int
-    cells: list[int]
-    n_e: int
-    states: int
-    ranks: int
-    solver: str
+    problem: str  # dimension and element order, as in 3D P2
+    large: bool  # whether slow methods are left out
+    dimension: int  # 2 or 3
+    cells: list[int]  # cells along each axis, (dimension,)
+    n_e: int  # number of tissue unknowns
+    states: int  # number of states of the first-order model
+    ranks: int  # number of ranks
+    solver: str  # solver of the midpoint matrix
     seconds: dict[str, float]  # mesh, assembly, factor
     step_us: dict[str, float]  # microseconds of a step by method
     drift: float  # of the energy after drift_steps
-    drift_steps: int
-    residual: float
+    drift_steps: int  # number of steps behind the drift
+    residual: float  # relative residual of a solve [1]
     memory_mb: float  # peak of all ranks [MiB]
     memory_base_mb: float  # peak of all ranks by the libraries alone [MiB]
-    repeats: int
-    steps_per_repeat: int
-    samples_us: dict[str, list[float]] = field(default_factory=dict)
+    repeats: int  # number of timed repeats
+    steps_per_repeat: int  # number of steps of a repeat
+    samples_us: dict[str, list[float]] = field(default_factory=dict)  # microseconds of a step in each repeat, by method
     ratio: float | None = None  # median of a TS step over PETSc's bare solves
     ratio_own: float | None = None  # median of a TS step over its own bare solves
-    factor_peer_s: dict[str, float] = field(default_factory=dict)
-    whole: WholeRun | None = None
+    factor_peer_s: dict[str, float] = field(default_factory=dict)  # seconds of the factorisation, by peer
+    whole: WholeRun | None = None  # the paper's whole run; None on other meshes
 
 
 def cells_for(dimension: int, size: int) -> list[int]:
@@ -156,7 +156,8 @@ def _steps(comm: MPI.Intracomm, model: Model, k: int, repeats: int, peers: bool)
 
     result = {
         "step_us": medians(samples), "samples_us": samples, "ratio": ratio("solve"), "ratio_own": ratio("own"),
-        "residual": run.check_step(ts, run.reached + 1), "factor_peer_s": factor, "drift": run.drift(),
+        "residual": run.check_step(ts, run.reached + 1), "factor_peer_s": factor,
+        "drift": run.ledger.drift(run.state, run.reached),
         "drift_steps": run.reached, "solver": run.solver[0],
     }  # fmt: skip
     ts.destroy()

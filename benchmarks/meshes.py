@@ -14,7 +14,7 @@ from mpi4py import MPI
 from rich.console import Console
 
 from benchmarks.driver import Curve, loglog, parse_list
-from softgrasp import package_version
+from softgrasp import __version__
 from softgrasp.fem import _stack as _stack  # threads and MPI before anything numerical
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
@@ -160,7 +160,7 @@ def run_mesh_study(
     trends = findings(rows)
     title = METHODS[method].title
     show(console, rows, trends, f"{title}, N = {N}, {comm.size} rank(s); !: unstable")
-    result = {"command": "mesh_study", "method": method, "N": N, "steps": steps, "version": package_version()}
+    result = {"command": "mesh_study", "method": method, "N": N, "steps": steps, "version": __version__}
     result |= {"ranks": comm.size, "machine": machine(), "rows": [asdict(row) for row in rows], **trends}
     if comm.rank == 0:
         out.mkdir(parents=True, exist_ok=True)

@@ -81,18 +81,18 @@ CSV |= {f"{name}_s": f"split.{name}" for name in STAGES}
 class SolverPoint:
     """One method on nx x 2 nx cells; a peer has fewer numbers."""
 
-    nx: int
-    ranks: int
-    method: str
-    states: int
+    nx: int  # number of cells along the short side
+    ranks: int  # number of ranks
+    method: str  # solver
+    states: int  # number of states, 2n
     seconds: float  # median
     rank: int  # of Z
     residual: float  # relative, recomputed from Z
     gain_difference: float | None  # relative, to the gain of the first method
     tissue_difference: float | None  # relative, of the tissue's rows alone, to the gain of the first method
     split: dict[str, float] = field(default_factory=dict)  # seconds by stage
-    solves: int = 0
-    newton_steps: int = 0
+    solves: int = 0  # number of shifted solves
+    newton_steps: int = 0  # number of Newton steps
     memory_mb: float = 0.0  # peak of all ranks [MiB]
     memory_base_mb: float = 0.0  # peak of all ranks before the first method [MiB]
 
@@ -143,12 +143,12 @@ def _differences(problem: RiccatiProblem, reference: Gain | None, gain: Gain) ->
 class PaperPlant(NamedTuple):
     """E x' = A x + B u and y = C x in the paper's own sparse form, weighted by Q and R."""
 
-    E: Any
-    A: Any
-    B: Array
-    C: Array
-    Q: Array
-    R: Array
+    E: Any  # mass matrix of the first-order form, (2n, 2n)
+    A: Any  # state matrix, (2n, 2n)
+    B: Array  # input matrix, (2n, n_s)
+    C: Array  # output matrix, (p, 2n)
+    Q: Array  # weight of the outputs, (p, p)
+    R: Array  # weight of the inputs, (n_s, n_s)
 
 
 def scipy_solver(plant: PaperPlant) -> Callable[[], Array]:

@@ -35,7 +35,7 @@ class Row:
 
     kind: str  # dimension and order
     n_e: int  # unknowns
-    solver: SolverName
+    solver: SolverName  # solver that was measured
     iterations: int  # iterations of a solve; 0 by a factor
     setup: float  # processor time [s]
     solve: float  # processor time, the median [s]

@@ -1,5 +1,5 @@
 # %% [markdown]
-# # Optimal feedback, and a controller for a 1 kHz loop
+# # Which feedback moves the hand best, and how does the loop answer?
 # The Riccati equation of the whole plant, the closed loop under its gain, and the small controller that a robot runs.
 # Run it with `python demos/demo_control.py`, or under `mpiexec -n 2`.
 
@@ -8,6 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 import softgrasp as sg
+from softgrasp.lqr.loop.margins import loop_margins
 
 speak = MPI.COMM_WORLD.rank == 0
 model = sg.build("paper_lqr", ["tissue.cells=[6, 12]"])
@@ -33,6 +34,7 @@ move = loop.run(solution.gain, target=[5.0, 3.0], steps=600)
 if speak:
     print("hand at the end", move.q_s[-1], "cost", move.cost[-1])
 assert abs(move.q_s[-1] - [5, 3]).max() < 1e-2  # 300 s are about five time constants of the slowest pole
+move.plot()
 
 # %% [markdown]
 # A robot measures its hand only. The controller carries a few numbers of the tissue itself; one tick is some
@@ -46,7 +48,16 @@ if speak:
 assert force @ [5.0, 3.0] > 0  # it pulls towards the target
 
 # %% [markdown]
-# Your own loop: each millisecond measure the hand, ask the controller, apply the force. Here a free hand represents
+# Bode diagram of the loop, opened at each input, with the controller's tissue model in it: gain, phase, margins.
+
+# %%
+margins = loop_margins(controller)
+if speak:
+    print(margins)
+margins.plot()
+
+# %% [markdown]
+# Your own loop: each millisecond measure the hand, ask the controller, apply the force. Here a free hand stands
 # for the robot.
 
 # %%

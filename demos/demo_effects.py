@@ -1,5 +1,5 @@
 # %% [markdown]
-# # Only the effects a scene calls for
+# # What does an effect cost, and what does it change?
 # Every effect is off unless the scene names it. This demo switches two on, one after the other, and looks at what they
 # add and at what they change.
 
@@ -37,3 +37,4 @@ swing, calm = (np.ptp((r.outputs - r.outputs_rigid)[-200:], axis=0).max() for r 
 if comm.rank == 0:
     print(f"swing of the tip in the last second: {swing:.3g} m undamped, {calm:.3g} m damped")
 assert calm < swing / 5
+damped.plot()

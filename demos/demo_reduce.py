@@ -1,5 +1,5 @@
 # %% [markdown]
-# # A reduced model that keeps the structure
+# # Which basis keeps the structure, and how accurate is it?
 # One run of the full model, a basis from its states, and small models that repeat it: at the same material and at
 # one they have not seen. Run it with `python demos/demo_reduce.py`, or under `mpiexec -n 2`.
 
@@ -56,3 +56,6 @@ if speak:
         slowest = abs(small.spectrum.eigenvalues).min()
         print(f"mu = {mu:.0f} Pa: stable {small.stable}, lowest frequency {slowest:.3f} rad/s")
         assert small.stable
+
+# %%
+rom.plot_errors(model, run)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from softgrasp.fem.accuracy.adapt import build as build
     from softgrasp.fem.model.build import Model as Model
+    from softgrasp.fem.model.terms import Term as Term
     from softgrasp.fem.run.simulate import simulate as simulate
     from softgrasp.fem.scene.file import load_scene as load_scene
     from softgrasp.fem.scene.scene import Scene as Scene
@@ -31,8 +32,9 @@ if TYPE_CHECKING:
     from softgrasp.reduction.archive import load as load
     from softgrasp.reduction.archive import save as save
     from softgrasp.reduction.contact.model import contact_model as contact_model
-    from softgrasp.reduction.gradient import gradient as gradient
+    from softgrasp.reduction.gradient.face import gradient as gradient
     from softgrasp.reduction.identify.identify import identify as identify
+    from softgrasp.reduction.identify.suggest import suggest_markers as suggest_markers
     from softgrasp.reduction.reduce import errors as errors
     from softgrasp.reduction.reduce import reduce as reduce
     from softgrasp.reduction.reduce import replay as replay
@@ -44,20 +46,25 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy: r
 if "-no_signal_handler" not in (_given := os.environ.get("PETSC_OPTIONS", "")).split():
     os.environ["PETSC_OPTIONS"] = f"{_given} -no_signal_handler".strip()
 
+__version__ = "0.2.0"
+"""Version of this code; `pyproject.toml` reads it here."""
+
 PACKAGE = Path(__file__).parent
 """Folder of the package; in a checkout its subpackages are links to the folders beside it."""
 
 _FACE = {
     "Scene": "fem.scene.scene",
     "load_scene": "fem.scene.file",
+    "Term": "fem.model.terms",
     "Model": "fem.model.build",
     "build": "fem.accuracy.adapt",
     "simulate": "fem.run.simulate",
     "reduce": "reduction.reduce",
     "replay": "reduction.reduce",
     "errors": "reduction.reduce",
-    "gradient": "reduction.gradient",
+    "gradient": "reduction.gradient.face",
     "identify": "reduction.identify.identify",
+    "suggest_markers": "reduction.identify.suggest",
     "contact_model": "reduction.contact.model",
     "save": "reduction.archive",
     "load": "reduction.archive",
@@ -75,16 +82,6 @@ _FACE = {
 __all__ = sorted(_FACE)
 
 
-def package_version() -> str:
-    """Version of the installed distribution, or "source" in a bare checkout."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("softgrasp")
-    except PackageNotFoundError:
-        return "source"
-
-
 def __getattr__(name: str) -> Any:
     if name in _FACE:
         value = getattr(import_module(f"softgrasp.{_FACE[name]}"), name)
@@ -92,8 +89,6 @@ def __getattr__(name: str) -> Any:
         return value
     if name in ("fem", "reduction", "lqr", "study"):
         return import_module(f"softgrasp.{name}")
-    if name == "__version__":
-        return package_version()
     raise AttributeError(f"module 'softgrasp' has no attribute {name!r}; it has {', '.join(__all__)}")
 
 

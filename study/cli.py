@@ -16,6 +16,8 @@ import typer
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.study.export.command import export
+from softgrasp.study.identify.command import identify
+from softgrasp.study.serve.command import serve
 from softgrasp.study.shell.ending import console, rank, run_command
 from softgrasp.study.shell.folder import default_folder
 from softgrasp.study.shell.options import parse_tolerance, takes
@@ -49,9 +51,9 @@ app = typer.Typer(
 
 def _show_version(show: bool) -> None:
     if show:
-        from softgrasp import package_version
+        from softgrasp import __version__
 
-        typer.echo(f"softgrasp {package_version()}")
+        typer.echo(f"softgrasp {__version__}")
         raise typer.Exit
 
 
@@ -286,46 +288,9 @@ def query(
     raise typer.Exit(status)
 
 
-@app.command(rich_help_panel=MODEL)
-@takes("scene data fit noise offset shift robust refine columns out set_ quiet pictures empty pdf")
-def identify(
-    data: Annotated[
-        list[Path],
-        typer.Argument(
-            help="CSV files, an experiment each: columns time, outputs as tip_x, perhaps the hand as q_x; s and m"
-        ),
-    ],
-    fit: Annotated[str, typer.Option(help="parameters: mu, lambda, rho, beta; of a layer as skin.mu; with commas")],
-    noise: Annotated[
-        str, typer.Option(help="standard deviation of the measured numbers, in m: 1e-3, or tip=1e-3,mid_x=2e-3")
-    ],
-    offset: Annotated[bool, typer.Option("--offset", help="fit a constant error of each output too")] = False,
-    shift: Annotated[bool, typer.Option("--shift", help="fit a time shift between hand and outputs too")] = False,
-    robust: Annotated[bool, typer.Option("--robust", help="a loss in which outliers count little")] = False,
-    refine: Annotated[
-        bool, typer.Option("--refine", help="refine the mesh and the time step where they exceed the noise")
-    ] = False,
-    columns: Annotated[int, typer.Option(help="dimension of the reduced models; grows where it must", min=6)] = 36,
-    **shared: Any,
-) -> None:
-    """Fit the material of a scene to measurements, with the error of each value by its causes.
-
-    The scene gives the motion of the hand, the outputs and the values to start from; empty cells are missing samples.
-
-    The error has parts by noise, mesh, time step and reduction. fitted.toml is the scene with the values.
-
-    Refused, with exit status 3: a misfit beyond chance, a mesh or time step that changes a value by more than the noise
-    (--refine mends both), a direction that the data do not see, a fit that does not converge.
-
-    Example: softgrasp identify my.toml camera.csv --fit mu,lambda,beta --noise 1e-3
-    """
-    from softgrasp.study.identify.run import run_identify
-
-    raise typer.Exit(_run(run_identify, data=data, fit=fit, noise=noise, offset=offset, shift=shift, robust=robust,
-        refine=refine, columns=columns, **shared))  # fmt: skip
-
-
+app.command(rich_help_panel=MODEL)(identify)
 app.command(rich_help_panel=MODEL)(export)
+app.command(rich_help_panel=MODEL)(serve)
 
 
 @app.command(rich_help_panel=MODEL)

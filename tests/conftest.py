@@ -64,6 +64,7 @@ def pytest_runtest_makereport(
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--queries", type=int, default=500, help="random queries of the slow test of certified models")
     parser.addoption("--seed", type=int, default=1, help="of the random queries")
+    parser.addoption("--own-ranks", action="store_true", help="only tests whose mark names this number of ranks")
 
 
 @pytest.hookimpl(trylast=True)
@@ -73,21 +74,31 @@ def pytest_configure(config: pytest.Config) -> None:
         reporter._tw._file = open(os.devnull, "w")  # noqa: SIM115  (lives as long as the process)
 
 
+def _named(mark: pytest.Mark) -> int:
+    """Most ranks that a mark ``ranks`` names: 3 where it names none."""
+    return int(mark.args[0]) if mark.args else 3
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Do not even import files whose tests all skip: on three ranks, and with ``-m ranks``, those without the mark."""
-    if not collection_path.name.startswith("test_") or not (OWN.size > 2 or "ranks" in config.option.markexpr):
+    """Do not even import files none of whose tests run: on 3 ranks and with ``--own-ranks`` those without the mark."""
+    own = config.option.own_ranks
+    if not collection_path.name.startswith("test_") or not (OWN.size > 2 or own or "ranks" in config.option.markexpr):
         return None
-    most = [int(n or 3) for n in re.findall(r"\bmark\.ranks\b(?:\((\d)\))?", collection_path.read_text())]
-    return max(most, default=0) < OWN.size or None
+    named = [int(n or 3) for n in re.findall(r"\bmark\.ranks\b(?:\((\d)\))?", collection_path.read_text())]
+    return not any(n == OWN.size if own else n >= OWN.size for n in named) or None
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Most ranks of a test: 1 where marked serial, 3 where marked ranks, n where ranks(n); else 2, and 1 above lqr."""
+    if config.option.own_ranks:
+        found = [item for item in items if (mark := item.get_closest_marker("ranks")) and _named(mark) == OWN.size]
+        config.hook.pytest_deselected(items=[item for item in items if item not in set(found)])
+        items[:] = found
     for item in items:
         mark = item.get_closest_marker("ranks")
         most = 1 if SERIAL & set(item.path.relative_to(item.config.rootpath).parts) else 2
         if mark is not None:
-            most = mark.args[0] if mark.args else 3
+            most = _named(mark)
         if item.get_closest_marker("serial"):
             most = 1
         if OWN.size > most:

@@ -1,4 +1,4 @@
-"""Every demo runs, on all ranks, and so does the Python of the README."""
+"""Every demo runs, on one rank and two, and so does the Python of the README."""
 
 from __future__ import annotations
 
@@ -8,14 +8,19 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.ranks
+pytestmark = pytest.mark.ranks(2)
 
 ROOT = Path(__file__).parents[1]
 DEMOS = sorted((ROOT / "demos").glob("demo_*.py"))
+LONG = ("demo_own_basis", "demo_certified", "demo_finite_strain")  # 3 to 8 s on one rank
 
 
-@pytest.mark.parametrize("path", DEMOS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", [pytest.param(p, marks=[pytest.mark.slow] * (p.stem in LONG), id=p.stem) for p in DEMOS]
+)
 def test_demo(path: Path, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without figures, which cost more than the rest; `make docs` and tests/test_shown.py draw them."""
+    monkeypatch.setattr("softgrasp.fem.run.trajectory.drawn", lambda *of: None)
     monkeypatch.chdir(mpi_tmp_path)
     runpy.run_path(str(path), run_name="__main__")
 

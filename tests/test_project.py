@@ -16,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+import softgrasp
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("fem", "reduction", "lqr", "study")
 OWN_COMMENTS = PACKAGES  # whose fields have a comment each
@@ -227,6 +229,17 @@ def test_no_path_of_a_machine_in_the_tree() -> None:
     assert [line for line in found if "re.compile" not in line] == []
 
 
+@pytest.mark.serial
+def test_what_is_cited_is_the_version_of_the_code() -> None:
+    """Also where another version is installed: pages and results name that of the code that ran."""
+    version = softgrasp.__version__
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    readme = (ROOT / "README.md").read_text()
+    assert f"version {version}" in readme
+    assert f"version = {{{version}}}" in readme
+    assert re.search(r"^## \[(\d.*?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[1] == version
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel of this tree, built from a copy: building leaves files behind."""
@@ -251,6 +264,7 @@ def test_wheel_is_one_package_and_does_not_ask_for_a_solver(wheel: Path) -> None
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
         metadata = archive.read(next(n for n in names if n.endswith("METADATA"))).decode()
+    assert f"\nVersion: {softgrasp.__version__}\n" in metadata
     assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == {"softgrasp"}
     outside = {path.name for path in BESIDE} - {path.name for path in SOURCES}
     assert {"riccati.py", "faults.py", "paper.py"} <= {path.name for path in BESIDE}

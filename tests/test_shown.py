@@ -77,11 +77,18 @@ def test_units_and_labels_of_a_run(objects: dict[str, Any]) -> None:
     assert data.force.attrs["units"] == "N"
     np.testing.assert_array_equal(data.outputs.sel(output="tip_y"), run.outputs[:, 1])
     np.testing.assert_array_equal(data.midpoint, run.times[:-1] + run.times[1] / 2)
+    assert (data.energy.dims, data.energy.attrs["units"]) == (("time",), "J")
+    np.testing.assert_array_equal(run.to_pandas()["energy [J]"], run.energy)
     table = loop.to_pandas()
+    np.testing.assert_array_equal(table["dissipated [J]"], loop.dissipated)
     np.testing.assert_array_equal(table["inputs y [N]"][1:], loop.inputs[:, 1])
     assert np.isnan(table["inputs y [N]"].iloc[0])
-    assert objects["replay"].to_xarray().outputs.shape == (301, 2)
-    assert objects["strain_replay"].to_pandas().index.name == "time [s]"
+    small = objects["replay"].to_xarray()
+    assert small.outputs.shape == (301, 2)
+    # Craig-Bampton's model has its share of the tissue's energy, as of the motion
+    assert abs(small.energy - data.energy).max() < 0.1 * data.energy.max()
+    strained = objects["strain_replay"]
+    np.testing.assert_array_equal(strained.to_pandas()["energy [J]"], strained.energy)
 
 
 def test_figures_show_what_the_objects_hold(objects: dict[str, Any], tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-import jupytext
+import gallery  # beside this file
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
@@ -21,13 +21,30 @@ from softgrasp.fem.scene.scene import scene_schema
 
 ROOT = Path(__file__).parents[1]
 DEMOS = sorted((ROOT / "demos").glob("demo_*.py"))
+ORDER = (
+    "forward",
+    "finite_strain",
+    "foreign_mesh",
+    "reduce",
+    "own_basis",
+    "certified",
+    "control",
+    "effects",
+    "ranks",
+)  # of the gallery
 OWN_BASIS = "static_responses.py"
 ROOMS = {"fem": "Scene, model, run", "reduction": "Reduced models", "lqr": "Control", "study": "Many runs"}
 MORE = {
     "study": ["study.runs.sweep.SweepTable", "study.notebook.Film"],
-    "fem": ["fem.fields.series.SeriesWriter"],
-    "reduction": ["reduction.model.ReducedModel", "reduction.system.EnergySystem", "fem.reduced.ReducedSystem"],
-    "lqr": ["lqr.loop.margins.loop_margins", "lqr.loop.margins.LoopMargins"],
+    "fem": ["fem.run.trajectory.Trajectory", "fem.run.simulate.RunOptions", "fem.fields.series.SeriesWriter"],
+    "reduction": [
+        "reduction.bases.registry.METHODS",
+        "reduction.online.ReducedTrajectory",
+        "reduction.model.ReducedModel",
+        "reduction.system.EnergySystem",
+        "fem.reduced.ReducedSystem",
+    ],
+    "lqr": ["lqr.loop.full.LoopTrajectory", "lqr.loop.margins.loop_margins", "lqr.loop.margins.LoopMargins"],
 }
 
 
@@ -37,13 +54,16 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages["api.md"] = python_names()
     pages["changes.md"] = (ROOT / "CHANGELOG.md").read_text()
     pages[OWN_BASIS] = (ROOT / "demos" / OWN_BASIS).read_text()
-    for path in DEMOS:
-        name = path.stem.removeprefix("demo_")
-        book = jupytext.read(path)
-        pages[f"tutorials/{name}.md"] = tutorial(name, book)
-        pages[f"tutorials/{name}.ipynb"] = jupytext.writes(book, fmt="ipynb")
-    for name, text in pages.items():
-        files.append(File.generated(config, name, content=text))
+    shown = {each.name: each for each in gallery.tutorials(DEMOS)}
+    pages["tutorials/index.md"] = gallery.index([shown[name] for name in ORDER])
+    images = dict[str, bytes]()
+    for name, each in shown.items():
+        pages[f"tutorials/{name}.md"], pages[f"tutorials/{name}.ipynb"] = each.text, each.notebook
+        images |= each.images
+        if each.thumbnail is not None:
+            images[f"{name}/thumbnail.png"] = each.thumbnail
+    for place, content in (pages | {f"tutorials/{place}": data for place, data in images.items()}).items():
+        files.append(File.generated(config, place, content=content))
     return files
 
 
@@ -76,13 +96,6 @@ def python_names() -> str:
         names = [f"{module}.{name}" for name, module in softgrasp._FACE.items() if module.split(".")[0] == room]
         text += [f"## {title}", *(f"::: softgrasp.{name}" for name in [*names, *MORE[room]])]
     return "\n\n".join(text) + "\n"
-
-
-def tutorial(name: str, book: Any) -> str:
-    """A page with the text and the code of a script in cells."""
-    parts = [cell.source if cell.cell_type == "markdown" else f"```python\n{cell.source}\n```" for cell in book.cells]
-    note = f"*The same as a [notebook]({name}.ipynb); the script is `demos/demo_{name}.py`, which the tests run.*"
-    return "\n\n".join([parts[0], note, *parts[1:]])
 
 
 def scene_keys(schema: dict[str, Any]) -> str:

@@ -19,7 +19,7 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("fem", "reduction", "lqr", "study")
 COLOURS = {"fem": "#dcebf7", "reduction": "#e2f2e4", "lqr": "#fdeeda", "study": "#efe6f5"}
-WIDTH, HEIGHT, GAP, BESIDE = 1.7, 0.95, 0.4, 0.25
+WIDTH, HEIGHT, GAP, BESIDE = 1.7, 1.15, 0.4, 0.25
 
 
 def lines_of(package: str) -> list[list[str]]:

@@ -72,13 +72,16 @@ def tick_seconds(controller: Controller) -> float:
 
 
 def save_controllers(study: GainStudy, out: Path, target: PlantState) -> list[Path]:
-    """controller.npz and observer.npz for the robot, gain.npz of full order with x_bar. Collective."""
+    """controller.npz, observer.npz and plan.npz for the robot, gain.npz of full order with x_bar. Collective."""
     design, layout = study.design, study.design.problem.layout
     files = []
     if study.controller is not None and layout.comm.rank == 0:
         files.append(study.controller.controller.save(out / "controller.npz"))
     if study.observed is not None and layout.comm.rank == 0:
         files.append(study.observed.observed.controller.save(out / "observer.npz"))
+    online = study.planned.planned.online if isinstance(study, ControlStudy) and study.planned is not None else None
+    if online is not None and layout.comm.rank == 0:
+        files.append(online.controller.save(out / "plan.npz"))
     return [*files, save_gain(out / "gain.npz", design.gain, target, layout, scene_hash(design.model.scene))]
 
 
@@ -96,7 +99,7 @@ def run_finite(design: Design, model: Model, linear: LoopTrajectory, plan: LoopP
     try:
         run = loop.run(design.gain, target, plan.steps, design.actuation, start, options)
     except SolverError as error:  # it diverges, or leaves what the law describes
-        return FiniteLoop(points.law, None, target, str(error))
+        return FiniteLoop(points.laws.name, None, target, str(error))
     finally:
         loop.destroy()
     away, expected = (np.linalg.norm(r.outputs - t.y, axis=1) for r, t in ((run, target), (linear, design.target)))
@@ -105,7 +108,7 @@ def run_finite(design: Design, model: Model, linear: LoopTrajectory, plan: LoopP
         reason = f"the outputs end {away[-1]:.3g} m from their target, on the linear plant {expected[-1]:.3g} m"
     excess = float(run.cost[-1] / linear.cost[-1] - 1) if linear.cost[-1] > 0 else 0.0
     past = overshoot(run.outputs, target.y), overshoot(linear.outputs, design.target.y)
-    return FiniteLoop(points.law, run, target, reason, excess, *past)
+    return FiniteLoop(points.laws.name, run, target, reason, excess, *past)
 
 
 def run_loops(design: Design, bases: Sequence[BasisGains], plan: LoopPlan, frames: Frames, notify: Notify) -> LoopRuns:

@@ -75,7 +75,7 @@ def figure_gains(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ...]
             style.direct_labels(ax, ends)
         axes[-1].set_xlabel("N, order of the reduced equation")
         if bad:
-            text = "unstable loop; on the edge: error above 1"
+            text = "unstable loop; on the edge: error above 100 %"
             figure.legend(handles=[Line2D([], [], label=text, **CROSS)], loc="outside upper left")
         return style.save(figure, out_png)
 

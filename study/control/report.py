@@ -9,8 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem import hand_columns
-from softgrasp.lqr import BasisGains, Design, GainQuality, LoopMargins, RiccatiSolution, rigid_gains, running_words
+from softgrasp.fem import Array, hand_columns
+from softgrasp.lqr import (
+    BasisGains,
+    Design,
+    GainQuality,
+    LoopMargins,
+    RiccatiProblem,
+    RiccatiSolution,
+    rigid_gains,
+    running_words,
+)
 from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, gain_change, settled
 from softgrasp.study.forward.result import trajectory_header
 from softgrasp.study.pictures import speed_up
@@ -91,11 +100,25 @@ MARGINS: Columns = {
 }  # fmt: skip
 
 
+def _rigid_gain_rows(problem: RiccatiProblem, gains: tuple[Array, Array]) -> list[tuple[str, str]]:
+    """A row for each load on the hand and each kind of gain, by axis: "-1 N/m in x"; rounding of others is zero."""
+    columns, rows = hand_columns(problem.layout.n_s, problem.layout.dimension), []
+    for kind, per, gain in (("displaced", "m", gains[0]), ("moving", "(m/s)", gains[1])):
+        small = 1e-6 * np.abs(gain).max(initial=0.0)  # what rounding and the solver's tolerance leave
+        for column, row in zip(columns, gain, strict=True):
+            load = f"{'torque about' if column.rotation else 'force along'} {column.axis[-1]}"
+            unit = f"{column.load_unit}/{per}"
+            parts = [
+                f"{v if abs(v) > small else 0.0:.5g} {unit} in {axis}" for v, axis in zip(row, "xyz", strict=False)
+            ]
+            rows.append((f"{load}, body {kind}", ", ".join(parts)))
+    return rows
+
+
 def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[str, str]]:
     """The short table as label and text: Riccati equation, closed loop, small controller, re-tuning."""
     solution, gains = study.design.solution, rigid_gains(study.design.problem, study.design.solution)
     counts = [str(n) for n in (solution.rank, *(solution.counts.get(k, 0) for k in ("newton_steps", "solves")))]
-    displaced, moving = ("; ".join(" ".join(f"{v:.5g}" for v in row) for row in gain) for gain in gains)
     rows = [
         ("method", solution.summary),
         ("rank, Newton steps, solves", ", ".join(counts)),
@@ -103,8 +126,7 @@ def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[st
         *_settled_gain(solution),
         ("optimal cost from the start", f"{study.design.gain_check.optimal:.6g}"),
         *_spectrum(study.design),
-        ("gain, body displaced", displaced),
-        ("gain, body moving", moving),
+        *_rigid_gain_rows(study.design.problem, gains),
     ]
     whole = study if isinstance(study, ControlStudy) else None
     if whole is not None:
@@ -166,7 +188,7 @@ def summary(study: GainStudy) -> list[str]:
         cost = f"The move{free} costs {paid:.4g}; the Riccati equation predicts {optimal:.4g}."
         if full.saturated:
             excess = (paid + study.loops.to_come) / optimal - 1
-            cost = f"With the limits of the loads the move costs {excess:.2%} more than without them."
+            cost = f"With the limits of the loads the move costs {percent(excess)} more than without them."
     if study.controller is None:
         return [first, cost, "No small controller is certified, see the notes."]
     c = study.controller.controller

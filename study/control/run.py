@@ -11,8 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TaskProgressColumn
 
-from softgrasp.fem import Loop, Model, Stopwatch, remove_own, scene_hash
-from softgrasp.fem.solve.stiffness import sharing_factors
+from softgrasp.fem import Loop, Model, Stopwatch, remove_own, scene_hash, sharing_factors
 from softgrasp.lqr import A_PRIORI, Design, PlantState, control_of, finite_problem, linearised, with_control
 from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import design
@@ -45,11 +44,12 @@ def run_control(
     Nothing is written before the Riccati equation is solved, but restart files of a large plant: the next call with
     the same scene, folder and rank count goes on from them; they are removed at the end. ``gain_only`` writes the
     controllers, without closed loop and pictures; ``retune`` solves the full equation at the corners, edges and the
-    middle of the box of lambda and mu, to compare re-tuned gains with.
+    middle of the box of lambda and mu, to compare re-tuned gains with. Returns the content of result.json.
     """
     session = Session("control", path, overrides, out, console, **flags)
     scene = session.scene()
     scene.refuse_contact("control")
+    scene.refuse_frame("control")
     model, sentence = with_control(session.model(scene, steps=False))
     if sentence:
         console.print(sentence, soft_wrap=True, markup=False)
@@ -69,6 +69,10 @@ def run_control(
             from softgrasp.lqr.design.observer import require_observable  # no other scene needs it
 
             require_observable(plant)
+        if control_of(model).constraints is not None:
+            from softgrasp.lqr.design.constrained import require_plan  # no other scene needs it
+
+            require_plan(plant)
         with sharing_factors(plant.system):
             feedback = design(plant, watch, solver_bar(bar, model), restart)
             if control_of(model).observer is not None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem import EFFECTS, Array, Scene, SceneError, TissueMesh, Trajectory, make_outputs, young_poisson
+from softgrasp.fem.material import of_layers
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.motion import Force, motion_table
 from softgrasp.fem.run.simulate import RunOptions, simulate
@@ -154,7 +155,7 @@ def check_elements(
     model: Model, trajectory: Trajectory, tolerance: float, mesh: TissueMesh | None = None
 ) -> Elements | None:
     """Run the scene with P2 when it has P1 and a ratio of Poisson at which P1 locks, else None. Collective."""
-    nu = max(young_poisson(m.lam, m.mu)[1] for m in model.system.materials)
+    nu = max(young_poisson(m.lam, m.mu)[1] for m in of_layers(model.system.materials))
     if model.scene.tissue.order != 1 or nu <= LOCKING + 1e-9:
         return None
     other = build(quadratic(model), comm=model.system.layout.comm, mesh=mesh)

@@ -14,22 +14,22 @@ from matplotlib.patches import Patch
 from softgrasp.fem import Scene
 from softgrasp.study.effects.result import EffectResult, EffectsStudy
 from softgrasp.study.pictures import BLUE, GREEN, HAND, ORANGE, OUTLINE, WIDTH, paper_style, save
-from softgrasp.study.report import Columns, Page, Section, Table, listed, percent, table_of
+from softgrasp.study.report import Columns, Page, Section, Table, in_words, percent, table_of
 from softgrasp.study.shell import Session
 
 CAPTION = (
     "Each effect switched on against off, the rest of the scene as it is. Left: largest change of the outputs over the "
     "run, relative to their largest displacement; under a force, the same with the hand driven by the force that would "
-    "carry it along the motion without tissue, for effects that the run itself does not show; with a partner, the "
-    "change by an effect that shows only when another one is switched too. Right: what the effect adds to "
-    "the time of a step (median and quartiles of paired samples) and to the memory that the run holds. "
+    "carry it along the motion without tissue, for effects that do not change the run itself; with a partner, the "
+    "change by an effect that changes something only when another one is switched too. Right: what the effect adds to "
+    "the time of a step (median and quartiles of paired samples) and to the memory of the run. "
     "Grey: quartiles of the scene's step time against itself. Open marks: the effect is off in the scene and was tried."
 )
 HOW = (
     ("needed", "the effect changes the outputs by more than the tolerance, alone or with others that are advised"),
     ("beside advised", "the change when this effect alone is switched and all others are as advised"),
-    ("optional", "the effect does not show, but it costs nothing or the control problem needs it"),
-    ("wasted", "the effect costs work or memory, and no output shows it"),
+    ("optional", "the effect changes the outputs by less, but it costs nothing or the control problem needs it"),
+    ("wasted", "the effect costs work or memory and changes no output"),
     ("noise", "paired samples disagree, or differ by less than two steps of the same scene do"),
     ("costs", "counted operations and held memory decide; times are shown with their noise"),
     ("factor", "the time to factor S and to solve for the hand's equation before the first step"),
@@ -58,9 +58,9 @@ COSTS: Columns = {
     "effect adds": "name",
     "assembly": lambda f: _seconds(f.cost.assembly, f.cost.assembly_range),
     "factor": lambda f: _seconds(f.cost.setup, f.cost.setup_range),
-    "step": lambda f: f"{1e6 * f.cost.step:+.2f} us ({f.cost.step_relative:+.1%})" if f.cost.step_shows else "noise",
-    "operations": lambda f: f"{f.cost.flops:+.0f} ({f.cost.flops_relative:+.1%})",
-    "memory": lambda f: f"{f.cost.memory / 1024:+.1f} KiB ({f.cost.memory_relative:+.1%})",
+    "step": lambda f: _more(1e6 * f.cost.step, ".2f", " us", f.cost.step_relative) if f.cost.step_shows else "noise",
+    "operations": lambda f: _more(f.cost.flops, ".0f", "", f.cost.flops_relative),
+    "memory": lambda f: _more(f.cost.memory / 1024, ".1f", " KiB", f.cost.memory_relative),
     "PETSc objects": lambda f: ", ".join(f"{n:+d} {kind.lower()}" for kind, n in f.cost.objects.items()) or "none",
 }
 CSV: Columns = {
@@ -110,7 +110,8 @@ def parts(study: EffectsStudy) -> list[Section]:
         table_of(study.findings, VERDICTS, "Relative change, gate and verdict").section(NOTE, terminal=True),
         Section("Advice", rows=advice, terminal=True),
         Table(tuple(COSTS), [*table_of(study.tried, COSTS).rows, scene], "Costs").section(
-            f"The step time of the scene differs from itself by {low:+.1%} to {high:+.1%}.", terminal=True
+            f"The step time of the scene differs from itself by {percent(low, '+')} to {percent(high, '+')}.",
+            terminal=True,
         ),
         *([free.section(terminal=True)] if free.rows else []),
         Section("How an effect is tested", rows=how),
@@ -121,7 +122,7 @@ def summary(study: EffectsStudy) -> list[str]:
     """What came out, in three sentences."""
     labels = dict.fromkeys(f.label for f in study.findings)
     named = [(label, [f.name for f in study.findings if f.label == label]) for label in labels]
-    verdicts = [f"{label} {'is' if len(names) == 1 else 'are'} {listed(names)}" for label, names in named]
+    verdicts = [f"{label} {'is' if len(names) == 1 else 'are'} {in_words(names)}" for label, names in named]
     change, name = max((f.change.outputs, f.name) for f in study.tried if f.change is not None)
     free = sum(f.proof.holds for f in study.off if f.proof is not None)
     return [
@@ -140,7 +141,12 @@ def joint_changes(study: EffectsStudy) -> str:
         for f in study.findings
         if (c := f.company) is not None
     ]
-    return f"With {listed(study.beside)} on, switching one effect alone changes the outputs by: {', '.join(parts)}."
+    return f"With {in_words(study.beside)} on, switching one effect alone changes the outputs by: {', '.join(parts)}."
+
+
+def _more(value: float, form: str, unit: str, share: float) -> str:
+    """A cost beside the share by which it is larger."""
+    return f"{value:+{form}}{unit} ({percent(share, '+')})"
 
 
 def _seconds(median: float, spread: tuple[float, float]) -> str:

@@ -112,7 +112,10 @@ def study_effects(
 
 
 def _cost_of(case: MeasuredScene, mesh: float | None) -> dict[str, float]:
-    """Times [s], memory [byte] and operations of a scene; ``mesh``: time of a mesh that all share, None of its own."""
+    """Median times by stage [s], "memory" [byte] and "flops" of a step.
+
+    ``mesh``: time of a mesh that all variants share [s]; None where the scene has its own.
+    """
     times = {stage: float(np.median(case.seconds[stage])) for stage in ("mesh", "assembly", "setup", "step")}
     if mesh is not None:
         times["mesh"] = mesh
@@ -136,7 +139,18 @@ def check_variants(scene: Scene, comm: MPI.Intracomm, explanation: Explanation, 
 def run_effects(
     path: Path, out: Path, overrides: list[str], console: Console, *, quiet: bool = False, empty: bool = False
 ) -> dict[str, Any]:
-    """Judge the effects of a scene file and write result.json, table, picture and report. Collective."""
+    """Test the effects of a scene file and write result.json, table, picture and page. Collective.
+
+    Args:
+        path: scene file or name of a scene that ships.
+        out: folder of the results.
+        overrides: ``KEY=VALUE`` of ``--set``.
+        console: terminal.
+        quiet: no progress bars.
+        empty: remove what an earlier run has left in the folder.
+
+    Returns the content of result.json.
+    """
     session = Session("effects", path, overrides, out, console, quiet, empty=empty)
     comm, scene = session.comm, session.scene()
     console.print(f"effects at the tolerance {scene.study.tolerance:g}")

@@ -92,6 +92,10 @@ def _obstacle(scene: Scene, name: str, scales: Scales) -> str:
         return "the first frequency, which scales the trial value, is not computed"
     if name == "obstacles" and not on:
         return "there is no [[obstacle]] to try"
+    if name == "frame" and not on and not scene.effects.rotation:
+        return "the hand does not turn"
+    if name == "rotation" and on and scene.effects.frame is not None:
+        return "effects.frame needs it"
     if name == "rotation" and scene.motion.profile == "csv":
         return "the columns of motion.csv hold the angles" if on else "motion.csv has no columns for angles"
     return ""
@@ -122,6 +126,8 @@ def _trial(scene: Scene, name: str, scales: Scales) -> tuple[Any, Value]:
         beta = 2 * TRIAL_ZETA / scales.omega
         value = f"beta = {beta:.3g} s: zeta_1 = {TRIAL_ZETA:g}"
         return {"kind": "kelvin-voigt", "beta": beta}, (value, beta, "s")
+    if name == "frame":
+        return "hand", ("hand", None, "")
     if name == "finite_strain":
         return {"law": TRIAL_LAW}, (TRIAL_LAW, None, "")
     if name == "rotation":

@@ -16,7 +16,7 @@ Changes = dict[str, tuple[Change, float | None]]  # of the outputs, and under a 
 class Rival(NamedTuple):
     """Which effect is advised in place of one that shows as well."""
 
-    name: str
+    name: str  # name of the effect
     why: str  # what the scene's validation says of both
 
 

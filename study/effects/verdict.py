@@ -8,7 +8,7 @@ from softgrasp.study.effects.result import Change, Cost, EffectResult, JointChan
 from softgrasp.study.effects.switch import Switch
 from softgrasp.study.effects.together import Changes, JointAdvice, Rival
 from softgrasp.study.forward.explain import EffectReport, Explanation
-from softgrasp.study.report import listed, percent
+from softgrasp.study.report import in_words, percent
 
 
 def verdict_of(change: float, controls: bool, costs: bool, tolerance: float) -> str:
@@ -51,7 +51,7 @@ def assess(
     else:
         advice = _advice(s, verdict, change.outputs, why, cost, tolerance)
         if verdict == "needed" and company is not None and company.change.outputs <= tolerance:
-            others = listed([name for name in together.beside if name != s.name])
+            others = in_words([name for name in together.beside if name != s.name])
             advice += f" Beside {others} it changes them by {percent(company.change.outputs)} only."
     return EffectResult(s.name, s.on, s.value, gate, verdict, advice, change, control, company, cost, proof)
 
@@ -101,7 +101,7 @@ def _advice_apart(rival: Rival, change: float, company: JointChange | None, chan
 
 def _advice_together(s: Switch, change: float, company: JointChange, scene: Scene) -> str:
     """For an effect that shows only when others are switched too."""
-    partners, on = listed(company.partners), [EFFECTS[name].active(scene) for name in company.partners]
+    partners, on = in_words(company.partners), [EFFECTS[name].active(scene) for name in company.partners]
     force = " when a force moves the hand, as in the control problem" if company.forced else ""
     number = f"the outputs by {percent(company.together)}{force}, tolerance {percent(scene.study.tolerance)}"
     among = f", {_switching(company.among, scene)}," if company.among else ""
@@ -121,7 +121,7 @@ def _switching(names: tuple[str, ...], scene: Scene) -> str:
     """What is switched in the scene, in words."""
     off = [name for name in names if EFFECTS[name].active(scene)]
     on = [name for name in names if name not in off]
-    return " and ".join([*([f"with {listed(on)} on"] if on else []), *([f"without {listed(off)}"] if off else [])])
+    return " and ".join([*([f"with {in_words(on)} on"] if on else []), *([f"without {in_words(off)}"] if off else [])])
 
 
 def _change_in_words(change: float) -> str:

@@ -14,13 +14,20 @@ from softgrasp.reduction.export import write_c, write_fmu
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.study.shell.session import list_files
 
-DOORS = "--c FOLDER or --fmu FILE"
+TARGETS = "--c FOLDER or --fmu FILE"  # options of which at least one is given
 
 
 def run_export(
     path: Path, console: Console, *, c: Path | None = None, fmu: Path | None = None, tick: float = 1e-3
 ) -> None:
     """Write a saved model or controller for other programs, see ``softgrasp export --help``. Collective; rank 0 writes.
+
+    Args:
+        path: reduced model (.h5) or controller (.npz).
+        console: terminal.
+        c: folder of the C code; None for none.
+        fmu: file of the FMU, of a model only; None for none.
+        tick: time between two steps of an exported model [s]; a controller has its own.
 
     Raises:
         SoftgraspError: with one sentence; nothing is half-written.
@@ -31,10 +38,13 @@ def run_export(
 
 
 def _export(path: Path, console: Console, c: Path | None, fmu: Path | None, tick: float) -> None:
+    """Check the options, write and list the files; on rank 0."""
     if c is None and fmu is None:
-        raise SceneError(f"softgrasp export {path}: name what to write: {DOORS}")
+        raise SceneError(f"softgrasp export {path}: name what to write: {TARGETS}")
     if fmu is not None and fmu.suffix != ".fmu":
-        raise SceneError(f"--fmu {fmu}: simulators know an FMU by its ending; name it {fmu.with_suffix('.fmu').name}")
+        raise SceneError(
+            f"--fmu {fmu}: simulators recognise an FMU by its ending; name it {fmu.with_suffix('.fmu').name}"
+        )
     files = _controller(path, console, c, fmu) if path.suffix == ".npz" else _model(path, console, c, fmu, tick)
     list_files(console, files)
     if c is not None:
@@ -42,6 +52,7 @@ def _export(path: Path, console: Console, c: Path | None, fmu: Path | None, tick
 
 
 def _controller(path: Path, console: Console, c: Path | None, fmu: Path | None) -> list[Path]:
+    """Files of the C code of a controller. Raises SceneError: an FMU was asked for."""
     from softgrasp.lqr.export.controller import write_controller  # with lqr, which models do not need
     from softgrasp.lqr.loop.controller import Controller
 
@@ -49,12 +60,16 @@ def _controller(path: Path, console: Console, c: Path | None, fmu: Path | None) 
         raise SceneError(f"--fmu {fmu}: {path} is a controller, which is exported with --c FOLDER")
     controller = Controller.load(path)
     seen = "no observer" if controller.observer is None else f"an observer of {len(controller.observer.C)} samples"
+    if controller.planner is not None:
+        own = controller.planner
+        seen += f", a plan of {own.variables} variables and {own.count(0)} to {own.count(own.H)} rows"
     text = f"{path.name}: N = {controller.plant.N}, {seen}, a tick of {controller.period:g} s"
     console.print(text, soft_wrap=True, markup=False)
     return write_controller(controller, c)
 
 
 def _model(path: Path, console: Console, c: Path | None, fmu: Path | None, tick: float) -> list[Path]:
+    """Files of the C code and the FMU of a model. Raises SceneError: it is of finite strain."""
     model = load(path)
     if not isinstance(model, ReducedModel):
         raise SceneError(f"{path}: only linear reduced models are exported; this one is of finite strain")

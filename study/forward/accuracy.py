@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem import SoftgraspError, estimated
+from softgrasp.fem import Scene, SceneError, SoftgraspError, estimated
 from softgrasp.fem.accuracy.price import affordable, plans
 from softgrasp.study.report import percent
 
@@ -20,6 +20,13 @@ if TYPE_CHECKING:
 NOT_LINEAR = "The error of mesh and time step is estimated for linear elasticity only"
 
 
+def check_estimated(scene: Scene) -> None:
+    """Raise SceneError for finite strain, or the frame of a turning hand, of which no error is estimated."""
+    scene.refuse_frame("--certify")
+    if scene.effects.finite_strain is not None:
+        raise SceneError(f"{NOT_LINEAR}: leave out --certify, or set effects.finite_strain to false")
+
+
 def estimate_error(model: Model, budget: float | None = None) -> tuple[MeshEstimate | None, str]:
     """The estimate of a model's mesh, or why there is none. Collective.
 
@@ -27,6 +34,8 @@ def estimate_error(model: Model, budget: float | None = None) -> tuple[MeshEstim
     """
     if model.system.points is not None:  # the small models are of linear elasticity
         return None, f"{NOT_LINEAR}; with effects.finite_strain compare with a finer mesh and more steps."
+    if model.system.frame is not None:
+        return None, f"{NOT_LINEAR} and small angles; with effects.frame compare with a finer mesh and more steps."
     if model.accuracy is not None:
         return model.accuracy, ""
     plan = affordable(model, math.inf if budget is None else budget)

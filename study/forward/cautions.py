@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgrasp.fem import ITERATIVE, SMALL_SHARE, BlockSystem, Model, Trajectory, linear_error, motion_table, spread
+from softgrasp.fem import (
+    ITERATIVE,
+    SMALL_SHARE,
+    BlockSystem,
+    Model,
+    Trajectory,
+    linear_error,
+    motion_table,
+    percent,
+    spread,
+)
 from softgrasp.fem.model.scales import SMALL_STRAIN, gradient, magnified, slowest
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.scene.materials import young_poisson
@@ -24,7 +34,8 @@ OVERSHOOT = 2.0  # largest response of an undamped mode to a sudden load, over t
 def poisson_ratios(system: BlockSystem) -> dict[str, float]:
     """Poisson's ratio of each material by the name of its layer [1]."""
     names = [blocks.name for blocks in system.layers]
-    return {n: young_poisson(m.lam, m.mu)[1] for n, m in zip(names, system.materials, strict=True)}
+    pairs = zip(names, system.materials, strict=True)
+    return {n: young_poisson(m.lam, m.mu)[1] for n, m in pairs if not m.part}
 
 
 def locking(poisson: dict[str, float], order: int) -> list[str]:
@@ -50,7 +61,10 @@ def turned(angle: float) -> list[str]:
     """A hand angle [rad] too large for the linearised rotation."""
     if angle <= SMALL_ANGLE:
         return []
-    return [f"An angle of {angle:.3g} rad is not small: the linearised rotation stretches by {angle**2 / 2:.1%}."]
+    return [
+        f"An angle of {angle:.3g} rad is not small: the linearised rotation stretches by {percent(angle**2 / 2)}; "
+        "set effects.frame = 'hand', which allows any angle."
+    ]
 
 
 def small_obstacles(model: Model) -> list[str]:
@@ -153,12 +167,18 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     steep = None if system.points is not None else gradient(model, z)
     if steep is not None and not steep.linear:
         texts.append(
-            f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {steep.share:.0%} of the "
-            f"body at t = {t:.3g} s, and at most {steep.typical:.2g} in {1 - SMALL_SHARE:.0%} of it: linear elasticity "
-            f"assumes small strains and rotations, with an error of about {linear_error(steep.rms, d):.2g} of the "
-            "deformation here" + ("." if scene.effects.rotation else "; set effects.finite_strain.law = 'neo-hooke'.")
+            f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {percent(steep.share)} of "
+            f"the body at t = {t:.3g} s, and at most {steep.typical:.2g} in {percent(1 - SMALL_SHARE)} of it: linear "
+            "elasticity assumes small strains and rotations, with an error of about "
+            f"{percent(linear_error(steep.rms, d))} of the deformation here"
+            + (
+                "."
+                if scene.effects.rotation and system.frame is None
+                else "; set effects.finite_strain.law = 'neo-hooke'."
+            )
         )
-    texts += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
+    if system.frame is None:
+        texts += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
     return texts + inexact(
         run.energy_drift,
         max(run.residuals),

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem import SMALL_STRAIN, Scene, expected_order, extrapolated, largest_acceleration, lowest_modes, spread
+from softgrasp.fem import (
+    SMALL_STRAIN,
+    Scene,
+    expected_order,
+    extrapolated,
+    largest_acceleration,
+    lowest_modes,
+    percent,
+    spread,
+)
 from softgrasp.fem.effects import EFFECTS, Gate
 from softgrasp.fem.effects.gate import SMALL_SHARE, Sag
 from softgrasp.fem.errors import MeshError, SceneError
@@ -46,41 +55,41 @@ LARGE = 200_000  # cells beyond which rank 0 does not look for the ends
 class SolverPlan:
     """Solver, reason and estimated memory of its factor over all ranks [byte] (0: no factor)."""
 
-    name: str
-    reason: str
-    factor_bytes: float
+    name: str  # name of the solver
+    reason: str  # why it is chosen
+    factor_bytes: float  # memory of the factor over all ranks [byte]; 0 without one
 
 
 @dataclass(frozen=True)
 class TimePlan:
     """Step and end [s] against the first periods T_k = 2 pi / omega_k of the clamped tissue [s, 1/s]."""
 
-    steps: int
-    dt: float
-    end: float
-    omega: tuple[float, ...]
-    periods: tuple[float, ...]
-    omega_dt: tuple[float, ...]
+    steps: int  # number of time steps
+    dt: float  # time step [s]
+    end: float  # end of the run [s]
+    omega: tuple[float, ...]  # first angular frequencies of the clamped tissue [1/s]
+    periods: tuple[float, ...]  # their periods 2 pi / omega [s]
+    omega_dt: tuple[float, ...]  # their products with the time step [1]
 
 
 @dataclass(frozen=True)
 class EffectReport:
     """One effect in this scene: `fem.effects` says what the entries mean."""
 
-    on: bool
-    term: str
-    operators: tuple[str, ...]
-    cost: str
-    gate: Gate
+    on: bool  # whether the scene switches it on
+    term: str  # its term in the equation
+    operators: tuple[str, ...]  # names of the operators that it adds
+    cost: str  # what it adds to a run, a sentence
+    gate: Gate  # number that decides whether it matters
 
 
 @dataclass(frozen=True)
 class EndReport:
     """Singular ends of one kind: how many points (2D) or edges (3D), and the smallest exponent alpha [1]."""
 
-    kind: str
-    count: int
-    alpha: float
+    kind: str  # kind of the ends in words
+    count: int  # number of points (2D) or edges (3D)
+    alpha: float  # smallest exponent of the solution there [1]
 
 
 @dataclass(frozen=True)
@@ -251,10 +260,10 @@ def _warnings(
     if effects["gravity"].on and not sag.gradient.linear and not effects["finite_strain"].on:
         texts.append(
             f"At rest under its weight the tissue would sag by {sag.largest:.2g} m and |grad z| would be above "
-            f"{SMALL_STRAIN} in {sag.gradient.share:.0%} of the body, and at most {sag.gradient.typical:.2g} in "
-            f"{1 - SMALL_SHARE:.0%} of it: linear elasticity assumes small strains and rotations, "
+            f"{SMALL_STRAIN} in {percent(sag.gradient.share)} of the body, and at most {sag.gradient.typical:.2g} in "
+            f"{percent(1 - SMALL_SHARE)} of it: linear elasticity assumes small strains and rotations, "
             "effects.finite_strain does not."
         )
-    if scene.effects.rotation:
+    if scene.effects.rotation and scene.effects.frame is None:
         texts += turned(max(map(abs, (scene.motion.target or [])[d:]), default=0.0))
     return texts

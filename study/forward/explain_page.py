@@ -11,7 +11,7 @@ from rich.console import Console
 from softgrasp.fem import SMALL_SHARE, SMALL_STRAIN, Forecast, size_text
 from softgrasp.fem.run.forecast import RELIABLE, START
 from softgrasp.study.forward.explain import EffectReport, Explanation, MeshReport, explain
-from softgrasp.study.report import EQUATION, Page, Section, listed, percent
+from softgrasp.study.report import EQUATION, Page, Section, in_words, percent
 from softgrasp.study.report.origin import origin
 from softgrasp.study.shell import Session, folder_lock
 
@@ -75,7 +75,9 @@ def sections(result: Explanation) -> list[Section]:
         Section("Sizes", rows=sizes),
         *forecast_section(result.forecasts),
         Section("At rest under its weight, the hand held still", rows=sag_rows(result)),
-        Section("Mesh", text="\n\n".join([*copied, *mesh_lines(result.mesh, result.dimension)])),
+        Section(
+            "Mesh", text="\n\n".join([*copied, *mesh_lines(result.mesh, result.dimension, result.effects["frame"].on)])
+        ),
         Section("Effects", rows=effects),
         *([Section("What is on", OPERATORS, rows=costs)] if costs else []),
         Section("First modes of the clamped tissue", no_modes, header=modes if periods else (), rows=periods),
@@ -84,7 +86,7 @@ def sections(result: Explanation) -> list[Section]:
 
 
 def _operators(names: Sequence[str]) -> str:
-    return f"the operator{'s' * (len(names) > 1)} {listed(names)}" if names else "no operator"
+    return f"the operator{'s' * (len(names) > 1)} {in_words(names)}" if names else "no operator"
 
 
 def forecast_section(forecasts: Sequence[Forecast]) -> list[Section]:
@@ -108,8 +110,8 @@ def summary(result: Explanation) -> list[str]:
     return [
         f"The tissue has n_e = {s.n_e} unknowns in {s.cells} cells; {result.solver.name} solves its "
         f"{result.time.steps} steps of {result.time.dt:.3g} s.",
-        f"Effects that are on: {listed(on)}; on although they do not matter: {listed(result.idle)}; off although they "
-        f"would matter: {listed(result.missing)}.",
+        f"Effects that are on: {in_words(on)}; on although they do not matter: {in_words(result.idle)}; "
+        f"off although they would matter: {in_words(result.missing)}.",
         f"Under its weight the tissue sags by {sag.largest:.2g} m; linear elasticity "
         f"{'is valid' if sag.gradient.linear else 'is not valid'} there.",
     ]
@@ -122,13 +124,13 @@ def sag_rows(result: Explanation) -> list[tuple[str, str]]:
     return [
         ("g", "(" + ", ".join(f"{x:g}" for x in sag.g) + f") m/s2{assumed}"),
         ("largest |z|", f"{sag.largest:.4g} m"),
-        ("|grad z|", f"{steep.largest:.3g} at most, above {steep.typical:.3g} in {SMALL_SHARE:.0%} of the body"),
+        ("|grad z|", f"{steep.largest:.3g} at most, above {steep.typical:.3g} in {percent(SMALL_SHARE)} of the body"),
         ("linear elasticity", f"{'valid' if steep.linear else 'not valid'}: |grad z| is above {SMALL_STRAIN} in "
-         f"{steep.share:.2%} of the body, at most {SMALL_SHARE:.0%} may be"),
+         f"{percent(steep.share)} of the body, at most {percent(SMALL_SHARE)} may be"),
     ]  # fmt: skip
 
 
-def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
+def mesh_lines(report: MeshReport, dimension: int, in_frame: bool = False) -> list[str]:
     """The report in sentences."""
     place = "point" if dimension == 2 else "edge"
     lines = [
@@ -153,7 +155,9 @@ def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
         )
     else:
         lines.append(
-            "The error of the mesh is not estimated here, as that takes some time; simulate --certify does it."
+            "The error of the mesh is not estimated in the frame of the hand."
+            if in_frame
+            else "The error of the mesh is not estimated here, as that takes some time; simulate --certify does it."
         )
     return lines
 

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 class ModelSizes:
     """Numbers of unknowns and entities; ``states`` is 2n of the first-order system."""
 
-    n_s: int
-    n_e: int
-    states: int
-    cells: int
-    nodes: int
-    nonzeros: int
-    ranks: int
+    n_s: int  # number of unknowns of the hand
+    n_e: int  # number of unknowns of the tissue
+    states: int  # number of states of the first-order system, 2n
+    cells: int  # number of cells
+    nodes: int  # number of nodes
+    nonzeros: int  # number of entries of K_ee
+    ranks: int  # number of ranks
 
 
 def model_sizes(model: Model) -> ModelSizes:
@@ -149,11 +149,13 @@ class Simulation:
         return texts
 
     def trajectory(self) -> Table:
-        """State at each time t, and the force at t - dt/2, mean over the step that ends at t; nan in the first row."""
+        """State and energies at each time t, mean force of the step that ends there; nan in the first row."""
         run, n_s = self.run, self.sizes.n_s
         header = trajectory_header(n_s, self.dimension, run.columns, velocity=True)
         header += [f"{c.label} [{c.load_unit}]" for c in self.hand("force")]
+        header += ["energy [J]", "dissipated [J]"]
         parts = [run.times, run.q_s, run.v_s, run.outputs, np.vstack([np.full(n_s, np.nan), run.force])]
+        parts += [run.energy, run.dissipated]
         if (contact := run.contact) is not None:
             for o, name in enumerate(contact.names):
                 axes = "xyz"[: self.dimension]
@@ -174,6 +176,8 @@ def contact_keys(contact: ContactRecord) -> dict[str, Any]:
         "rounds": contact.rounds,
         "columns": contact.columns,
         "boundary_nodes": contact.nodes,
+        "force_end": contact.force_end.sum(axis=0).tolist(),
+        "force_max": float(np.linalg.norm(contact.force.sum(axis=1), axis=1).max()),
         "obstacles": {
             name: {
                 "gap_min": float(contact.gap[:, o].min()),
@@ -191,15 +195,19 @@ def contact_keys(contact: ContactRecord) -> dict[str, Any]:
 def contact_rows(contact: ContactRecord) -> list[tuple[str, str]]:
     """What obstacles did, in words: one row each, and the energy that they took."""
     rows = []
+    without = "it" if contact.touching.any() else "the effect"
     for o, name in enumerate(contact.names):
         count, gap = int(contact.touching[:, o].max()), float(contact.gap[:, o].min())
         force = ", ".join(f"{x:.4g}" for x in contact.force_end[o])
         touched = (
             f"force ({force}) N at the end, at most {counted(count, 'node')} touching"
             if count
-            else f"never touched, least gap {gap:.3g} m: without the effect the run is the same"
+            else f"never touched, least gap {gap:.3g} m: without {without} the run is the same"
         )
         rows.append((f"obstacle {name}", touched))
+    if len(contact.names) > 1 and contact.touching.any():
+        force = ", ".join(f"{x:.4g}" for x in contact.force_end.sum(axis=0))
+        rows.append(("all obstacles", f"force ({force}) N at the end"))
     taken = f"{contact.touch:.3g} J at first touch, {contact.stopped:.3g} J by impulses"
     taken += f", {contact.rubbed:.3g} J by friction" if contact.rubbed else ""
     return [*rows, ("taken by contact", f"{taken}; deepest penetration {contact.penetration:.1e} m")]
@@ -207,13 +215,15 @@ def contact_rows(contact: ContactRecord) -> list[tuple[str, str]]:
 
 def newton_keys(newton: NewtonFigures) -> dict[str, float]:
     """How the steps of finite strain converged, for result.json."""
-    keys = {"mean": newton.mean, "max": newton.max, "factors": newton.factors, "min_J": newton.min_det}
-    return {**keys, "divided": newton.substepped}
+    keys = {"mean": newton.mean, "max": newton.max, "factors": newton.factors, "divided": newton.substepped}
+    return keys | ({"min_J": newton.min_det} if np.isfinite(newton.min_det) else {})
 
 
 def newton_text(newton: NewtonFigures) -> str:
-    """How the steps of finite strain converged, in words."""
+    """How the steps of finite strain, or in a turning frame, converged, in words."""
     substeps = f", {counted(newton.substepped, 'step')} by substeps" if newton.substepped else ""
+    if not np.isfinite(newton.min_det):  # the linear law has no det F
+        return f"{newton.mean:.3g} a step, at most {newton.max}"
     return (
         f"{newton.mean:.3g} a step, at most {newton.max}, {counted(newton.factors, 'new tangent')}{substeps}; "
         f"smallest det F {newton.min_det:.3g}"

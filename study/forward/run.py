@@ -17,7 +17,7 @@ from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError,
 from softgrasp.fem.run.forecast import Forecast
 from softgrasp.fem.run.frames import LIGHT
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, estimate_error
+from softgrasp.study.forward.accuracy import accuracy_report, check_estimated, estimate_error
 from softgrasp.study.forward.cautions import looked_at, run_warnings, small_obstacles
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures import Frames, speed_up
@@ -51,8 +51,8 @@ def run_simulate(
         raise SceneError("--empty removes what --resume goes on from; give one of them")
     session = Session("simulate", path, overrides, out, console, **flags)
     scene = session.scene()
-    if certify and scene.effects.finite_strain is not None:
-        raise SceneError(f"{NOT_LINEAR}: leave out --certify, or set effects.finite_strain to false")
+    if certify:
+        check_estimated(scene)
     if resume:
         check_ranks(session.comm, out / "checkpoint")
     model = session.model(scene)

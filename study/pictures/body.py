@@ -5,6 +5,7 @@ Everything comes in as arrays; nothing here computes a simulation.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from matplotlib.tri import Triangulation
 
 from softgrasp.fem import Array, PictureMesh
 from softgrasp.study.pictures import shapes, style
+from softgrasp.study.pictures.plate import around_bodies, hand_plate, held_facets
 from softgrasp.study.pictures.shapes import Shot
 from softgrasp.study.pictures.style import colour_map, length_unit, paper_style, pressure_unit, save
 
@@ -50,7 +52,7 @@ def make_shot(
     unit = length_unit(largest)
     norm = mpl.colors.Normalize(0.0, unit[0] * largest)
     polygons, grip = shapes.hand_polygons(picture) if picture.dimension == 2 else ([], shapes.contact_centre(picture))
-    path = grip + table[:, 1:] @ np.vstack([picture.rigid(unit, grip[None, :]) for unit in np.eye(picture.n_s)])
+    path = picture.path(table[:, 1:], grip)
     boxes = [_box(picture.points + u) for u in states] + [_box(path)]
     boxes += [_box(np.vstack(shapes.moved(picture, polygons, q))) for q in hands if polygons]
     if aim is not None:
@@ -98,13 +100,19 @@ def figure_move(
     with paper_style():
         meet = picture.dimension == 3 or shapes.overlap(picture, states)  # in 3D captions meet bodies
         apart = len(states) > 1 and meet
+        solid = apart and picture.dimension == 3
+        frames = around_bodies(picture, states, shot.hands) if solid else []
+        if solid:  # each body fills its panel; its place is in the title
+            shot = replace(shot, low=frames[0][0], high=frames[0][1])
         groups = [[i] for i in range(len(states))] if apart else [list(range(len(states)))]
         figure, axes = make_axes(shot, len(groups), captions=True)
         for ax, group in zip(axes, groups if apart else (), strict=False):
-            ax.set_title(_time(times[group[0]]), pad=3)
+            ax.set_title(_time(times[group[0]]) + (_place(shot.hands[group[0]]) if solid else ""), pad=3)
         colour_bar(figure, axes, shot)
         legend(figure, shot)
         settle(figure)
+        for ax, (low, high) in zip(axes, frames, strict=False):
+            ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         for ax, group in zip(axes, groups, strict=True):
             draw_surroundings(ax, shot, group)
             draw_scene(ax, shot, states[group], None if apart else times[group], shot.hands[group])
@@ -162,7 +170,7 @@ def make_axes(
     low, high = shot.low - pads[0] / scale, shot.high + pads[1] / scale
     w, h = (high - low) * scale
     size = beside[0] + columns * (w + GAP), beside[1] + rows * (h + GAP + LINE)
-    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, sharex=True, sharey=True)
+    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, sharex=not solid, sharey=not solid)
     figure.set_layout_engine("compressed", w_pad=GAP / 4, h_pad=GAP / 2, wspace=0.0, hspace=0.0)
     axes = list(grid.flat)
     for ax in axes:
@@ -213,7 +221,7 @@ def legend(figure: Any, shot: Shot) -> None:
     entries: list[Any] = []
     filled = len(shot.picture.cells) <= MANY_CELLS
     if shot.hand or filled:
-        entries.append(Patch(color=style.HAND, label="hand" if shot.hand else "held by the hand"))
+        entries.append(Patch(color=style.HAND, label="hand"))
     if filled and not shot.norm.vmax > 0:
         entries.append(Patch(color=colour_map()(0.0), label="tissue, not deformed"))
     if np.ptp(shot.path, axis=0).max() > 0:
@@ -229,6 +237,13 @@ def legend(figure: Any, shot: Shot) -> None:
 
 def _time(t: float) -> str:
     return f"t = {t:.3g} s"
+
+
+def _place(q: Array) -> str:
+    """Where the hand is, under the time, in two digits."""
+    x = q[:3]
+    near = np.abs(x) < max(1e-3 * float(np.abs(x).max()), 1e-5)
+    return f"\nat ({', '.join(f'{v:.2g}' for v in np.where(near, 0.0, x))}) m"
 
 
 def _upright(shot: Shot) -> bool:
@@ -257,6 +272,8 @@ def _caption(ax: Any, shot: Shot, box: Array, text: str) -> None:
 def _free_corner(shot: Shot) -> str:
     """The left corner that the bodies leave free: "top", "bottom" or "" for none."""
     way = shapes.seen(shot.path[-1] - shot.path[0])
+    if (np.abs(way) > shot.high - shot.low).any():  # the frame is that of one body of a longer way
+        return ""
     if abs(float(way[0])) < 0.5 * float((shot.high - shot.low)[0]):
         return ""
     return "top" if way.prod() > 0 else "bottom"
@@ -331,6 +348,9 @@ def _draw_3d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
         lines = LineCollection(outline(picture, x), colors=style.OUTLINE, linewidths=0.6, zorder=3)
         ax.add_collection(lines, autolim=False)
         return
+    for z, plate in zip((1.5, 2.5), hand_plate(picture, q), strict=True):
+        flat = [shapes.seen(polygon) for polygon in plate]
+        ax.add_collection(PolyCollection(flat, color=style.HAND, linewidths=0.3, zorder=z), autolim=False)
     faces, colours = _paint(shot, u, q)
     look: dict[str, Any] = {"facecolors": colours, "edgecolors": colours, "linewidths": 0.5, "joinstyle": "round"}
     ax.add_collection(PolyCollection(list(shapes.seen(faces)), zorder=2, rasterized=True, **look), autolim=False)
@@ -339,8 +359,7 @@ def _draw_3d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
 def _paint(shot: Shot, u: Array, q: Array) -> tuple[Array, Array]:
     """Visible boundary of one instant from back to front, (m, 3, 3) [m], and its shaded colours (m, 3)."""
     picture, view = shot.picture, shapes.view_direction()
-    code = np.array([1, len(picture.points), len(picture.points) ** 2])
-    held = np.isin(np.sort(picture.facets, axis=1) @ code, np.sort(picture.contact, axis=1) @ code)
+    held = held_facets(picture)
     corners = (picture.points + u)[picture.facets]
     normals = shapes.facet_normals(corners)
     front = normals @ view > 0

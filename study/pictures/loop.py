@@ -36,11 +36,11 @@ MANY_POINTS = 4000  # a line of more points is thinned, in print they coincide
 class _Panel:
     """One pair of axes with the same quantities of every run."""
 
-    label: str
+    label: str  # label of the axis
     values: Sequence[Array]  # of each run, (m + 1, names) for outputs, (m, names) for inputs
     names: Sequence[str]  # of the colours
     levels: Sequence[float]  # targets of outputs, limits of inputs
-    inputs: bool = False
+    inputs: bool = False  # whether the curves are inputs
 
 
 def histories(

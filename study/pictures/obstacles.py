@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
+from matplotlib.patheffects import withStroke
 
 from softgrasp.fem import Array, Ball, HalfSpace, Obstacle, Polytope, Shape
 from softgrasp.study.pictures import shapes
@@ -34,12 +35,15 @@ def draw_obstacle(ax: Any, shape: Shape, name: str, box: Array, shift: Array | f
         polygon = np.array([foot - size * along, foot + size * along, back + size * along, back - size * along])
         place = foot - 0.03 * size * shape.normal + size * along
     else:
-        (polygon,), _ = _polygons(shape, np.zeros(2) + shift, box)
+        (polygon,), _ = polygons(shape, np.zeros(2) + shift, box)
         place = polygon.mean(axis=0)
     ax.add_collection(PolyCollection([polygon], facecolors=GREY, edgecolors=OUTLINE, lw=0.8, zorder=BEHIND))
     margin = size * np.array([0.07, 0.025])
     place = np.clip(place, box[0] + margin, box[1] - margin)
-    ax.text(*place, name, ha="center", va="center", fontsize=7, color=OUTLINE, clip_on=True, zorder=7)
+    halo = [withStroke(linewidth=2.5, foreground=GREY)]  # over arrows, bodies and the path
+    ax.text(
+        *place, name, ha="center", va="center", fontsize=7, color=OUTLINE, clip_on=True, zorder=7, path_effects=halo
+    )
 
 
 def extent(obstacles: tuple[Obstacle, ...], times: Array, room: Array, box: Array) -> Array:
@@ -53,7 +57,7 @@ def extent(obstacles: tuple[Obstacle, ...], times: Array, room: Array, box: Arra
         if d == 2 and isinstance(obstacle.shape, HalfSpace):
             continue
         for t in times if obstacle.path is not None else times[:1]:
-            x = np.vstack(_polygons(obstacle.shape, np.zeros(d) + obstacle.shift(t), room)[0])
+            x = np.vstack(polygons(obstacle.shape, np.zeros(d) + obstacle.shift(t), room)[0])
             low, high = np.maximum(x.min(axis=0), least), np.minimum(x.max(axis=0), most)
             if (low < high).all():
                 box = np.array([np.minimum(box[0], low), np.maximum(box[1], high)])
@@ -83,7 +87,7 @@ def draw_surroundings(ax: Any, shot: Shot, numbers: list[int]) -> None:
             ax.quiver(*x[on].T, *arrows.T, color=HAND, width=0.012, zorder=6, **look, **head)
 
 
-def _polygons(shape: Shape, shift: Array, room: Array) -> tuple[list[Array], list[float]]:
+def polygons(shape: Shape, shift: Array, room: Array) -> tuple[list[Array], list[float]]:
     """The visible faces of an obstacle in the plane of the picture, and their brightness [1]; in 2D its outline."""
     if isinstance(shape, Ball):
         angle = np.linspace(0.0, 2 * np.pi, CORNERS, endpoint=False)
@@ -105,7 +109,7 @@ def _draw_solid(ax: Any, shape: Shape, shift: Array, room: Array) -> None:
     if isinstance(shape, Ball | Polytope):
         place = place + (shape.center if isinstance(shape, Ball) else shape.corners.mean(axis=0))
     before = place @ shapes.view_direction() > 0
-    faces, shades = _polygons(shape, shift, room)
+    faces, shades = polygons(shape, shift, room)
     colours = [(*(s * np.array(to_rgb(GREY))), CLEAR if before else 1.0) for s in shades]
     order = BEFORE if before else BEHIND
     ax.add_collection(

@@ -24,6 +24,8 @@ import matplotlib.pyplot as plt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullFormatter
 
+# loads a notebook's backend now: in a context of settings it would lose its own
+plt.draw_if_interactive()  # type: ignore[no-untyped-call]
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # Okabe and Ito
 SKY = "#56B4E9"  # of the same palette
 UNSTABLE = "#B00020"

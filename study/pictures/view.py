@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem import Collection, ResourceError, SceneError, check_file, no_pipe
+from softgrasp.fem import Collection, Obstacle, ResourceError, SceneError, check_file, load_scene, no_pipe
 
 SHOWN = 4  # number of bodies in a picture, equally spaced in time, first and last included
+OBSTACLE: dict[str, Any] = {"color": "#d0d0d0", "lighting": False, "show_edges": False}
 PEAK = 99  # percentile of the field at the end of the colour scale: corners are singular [%]
 
 
@@ -55,7 +56,7 @@ class Move:
         self.flat = first.bounds.z_max == first.bounds.z_min
         known = {*first.point_data.keys(), *first.cell_data.keys()}
         if field not in known:
-            raise SceneError(f"--field {field}: the files hold {', '.join(sorted(known))}")
+            raise SceneError(f"--field {field}: the files contain {', '.join(sorted(known))}")
         data = first.GetPointData() if field in first.point_data else first.GetCellData()
         values = data.GetAbstractArray(field)
         unit = values.GetInformation().Get(values.UNITS_LABEL())
@@ -65,12 +66,22 @@ class Move:
         # ends of the colours, from the bodies of a picture; for a vector its length counts
         low, high, top = (float(x) for x in (sizes.min(), np.percentile(sizes, PEAK), sizes.max()))
         self.range = low, high if high > low else top  # few nodes may have any, as of contact
+        self._obstacles = _obstacles(folder, 2 if self.flat else 3)
 
     def body(self, i: int) -> Any:
         """The surface of the deformed body at an instant, with the field as `value`."""
         grid = self._read(i)
         (grid.point_data if self.field in grid.point_data else grid.cell_data)["value"] = self._value(grid)
         return grid.warp_by_vector("displacement").extract_surface(algorithm=None, nonlinear_subdivision=1)
+
+    def obstacles(self, i: int) -> Any:
+        """The obstacles at an instant as far as they are near the body, in a plane behind it; None without any."""
+        if not self._obstacles:
+            return None
+        from softgrasp.study.pictures.solids import solids  # few scenes have any
+
+        x = np.asarray(self.body(i).points)
+        return solids(self._obstacles, self.times[i], np.array([x.min(axis=0), x.max(axis=0)]), self.flat)
 
     def label(self, i: int) -> str:
         """Time and place of the hand."""
@@ -87,6 +98,16 @@ class Move:
     def _value(self, grid: Any) -> np.ndarray:
         values = np.asarray(grid[self.field], dtype=np.float64)
         return values if values.ndim == 1 else np.asarray(np.linalg.norm(values, axis=1))
+
+
+def _obstacles(folder: Path, d: int) -> tuple[Obstacle, ...]:
+    """The obstacles of the scene of a run; none where its file is gone."""
+    if not (folder / "scene.toml").exists():
+        return ()
+    from softgrasp.fem.obstacles import make_obstacles  # few scenes have any
+
+    scene = load_scene(str(folder / "scene.toml"))
+    return make_obstacles(scene, d) if scene.obstacle else ()
 
 
 @contextmanager
@@ -128,6 +149,8 @@ def view(folder: Path, field: str, save: Path | None) -> None:
         plotter.subplot(0, column)
         body = move.body(i)
         plotter.add_mesh(body, name="body", show_scalar_bar=column == 0, **look)
+        if (around := move.obstacles(i)) is not None:
+            plotter.add_mesh(around, name="obstacles", **OBSTACLE)
         if move.flat:
             plotter.view_xy()
         if save is not None:
@@ -138,6 +161,8 @@ def view(folder: Path, field: str, save: Path | None) -> None:
         def show(t: float) -> None:
             i = int(np.argmin(np.abs(np.array(move.times) - t)))
             plotter.add_mesh(move.body(i), name="body", reset_camera=False, **look)
+            if (around := move.obstacles(i)) is not None:
+                plotter.add_mesh(around, name="obstacles", reset_camera=False, **OBSTACLE)
 
         plotter.add_slider_widget(show, (move.times[0], move.times[-1]), value=move.times[0], title="time [s]")
     plotter.show(screenshot=None if save is None else str(save))

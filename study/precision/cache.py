@@ -13,7 +13,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp import package_version
+from softgrasp import __version__
 from softgrasp.fem import Array, Scene, read_manifest, scene_hash, write_manifest
 from softgrasp.fem.errors import CheckpointError, Interrupted, raise_on_all_ranks
 from softgrasp.study.report import to_json
@@ -43,7 +43,7 @@ class Cache:
 
     def path(self, kind: str, key: dict[str, Any]) -> Path:
         """File of the values of a key."""
-        whole = {"scene": self.scene, "ranks": self.comm.size, "version": package_version(), "format": FORMAT} | key
+        whole = {"scene": self.scene, "ranks": self.comm.size, "version": __version__, "format": FORMAT} | key
         digest = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
         return self.folder / f"{kind}-{digest[:20]}.json"
 

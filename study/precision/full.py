@@ -99,7 +99,7 @@ class ProbedRun(Run):
 
     def record(self, n: int) -> None:
         """This rank's share of the places, and what the work of the load needs."""
-        self.pulls[n] = self.midpoint.pull()
+        self.ledger.pulls[n] = self.midpoint.pull()
         if self.probe is not None and len(self.probe.dofs):
             self.local_outputs[n] = self.probe.weights @ self.state.array[self.probe.dofs]
 

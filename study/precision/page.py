@@ -33,8 +33,7 @@ from softgrasp.study.precision.tables import (
     slope_table,
 )
 from softgrasp.study.reduce.linear.measure import PAPER_FULL, PAPER_REDUCED
-from softgrasp.study.report import EQUATION, Page, Section, percent, to_json
-from softgrasp.study.report.equation import control_equation
+from softgrasp.study.report import EQUATION, Page, Section, control_equation, percent, to_json
 from softgrasp.study.report.origin import command_line, origin, peak_memory_mb
 from softgrasp.study.shell import Session
 

@@ -119,19 +119,19 @@ class ReducedPoint(RunPoint):
     """A run of a reduced model; what is not named here is as in :class:`softgrasp.study.reduce.linear.result.Point`."""
 
     question: ClassVar[str] = "reduced"
-    method: str
-    N: int
-    N_tissue: int
-    split: tuple[int, ...]
-    error_canonical: float
-    error_energy: float
-    projection_error_deformation: float
-    projection_error: float
-    time_offline: float
-    time_setup: float
-    time_online: float
-    spectral_abscissa: float
-    stable: bool
+    method: str  # reduction method, as in [reduction]
+    N: int  # number of all columns of the basis
+    N_tissue: int  # number of columns of the tissue
+    split: tuple[int, ...]  # numbers of columns by part of the basis
+    error_canonical: float  # error of the states (q, p) [1]
+    error_energy: float  # error in the energy norm [1]
+    projection_error_deformation: float  # error of the deformation by projection alone [1]
+    projection_error: float  # error of the states by projection alone [1]
+    time_offline: float  # time of basis and projection [s]
+    time_setup: float  # time of the set-up of the reduced run [s]
+    time_online: float  # time of all steps of the reduced run [s]
+    spectral_abscissa: float  # largest real part of the poles [1/s]
+    stable: bool  # whether no pole grows
     error_full: float  # error of the states against the full run behind the model [1]
     error_full_deformation: float  # error of the deformation against the full run behind the model [1]
     error_outputs_full: float  # of the deformation of the outputs against that run
@@ -149,9 +149,9 @@ class BasisPoint(WorkPoint):
     """A factorisation of the snapshots at a tolerance; orthonormality is the largest entry of ``|U'U - I|``."""
 
     question: ClassVar[str] = "bases"
-    tolerance: float
-    columns: int
-    orthonormality: float
+    tolerance: float  # tolerance of the factorisation [1]
+    columns: int  # number of columns of U
+    orthonormality: float  # largest entry of |U'U - I| [1]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,15 +159,15 @@ class RiccatiPoint(WorkPoint):
     """A solution of the Riccati equation by a method at a tolerance; ``reason`` when it was not reached."""
 
     question: ClassVar[str] = "riccati"
-    method: str
-    tolerance: float
-    reason: str = ""
-    residual: float
-    repeats: int | None = None
-    rank: int | None = None
-    newton_steps: int | None = None
-    solves: int | None = None
-    factorisations: int | None = None
+    method: str  # solver
+    tolerance: float  # tolerance that was asked for [1]
+    reason: str = ""  # why it was not reached, else empty
+    residual: float  # relative residual, recomputed [1]
+    repeats: int | None = None  # number of timed repeats
+    rank: int | None = None  # number of columns of the factor Z
+    newton_steps: int | None = None  # number of Newton steps
+    solves: int | None = None  # number of shifted solves
+    factorisations: int | None = None  # number of shifted factorisations
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,17 +175,17 @@ class ReducedRiccatiPoint(WorkPoint):
     """A reduced gain on the full plant; what is not named is as in the GainReport of ``lqr``, without its bounds."""
 
     question: ClassVar[str] = "reduced_riccati"
-    method: str
-    N: int
+    method: str  # basis, as in [control]
+    N: int  # number of all columns of the basis
     error_P: float  # noqa: N815
     error_K: float  # noqa: N815
-    cost_excess: float
-    abscissa_full: float
-    time_are: float
-    stable: bool
-    certified: bool
-    reason: str
-    sampled_radius: float
+    cost_excess: float  # excess cost over the optimal one [1]
+    abscissa_full: float  # largest real part of the poles of the full loop [1/s]
+    time_are: float  # time of the reduced Riccati equation [s]
+    stable: bool  # whether the full loop is stable
+    certified: bool  # whether that is proved
+    reason: str  # why there is no gain, else empty
+    sampled_radius: float  # largest modulus of the poles from tick to tick [1]
     time_lift: float  # seconds to project the equation and to lift its gain
     time_basis: float  # seconds of the basis, all orders together
     scratch: float  # seconds with everything before it

@@ -39,12 +39,18 @@ class TimedModel(Point):
     p50: float  # median time of a step [s]; inf when it is unstable
     p99: float  # 99 % quantile of the time of a step [s]; inf when it is unstable
     max: float  # largest time of a step [s]; inf when it is unstable
-    times: Array  # times of its outputs [s]
-    values: Array  # outputs at these times [m, rad]
+    times: Array  # times of its outputs, (steps + 1,) [s]
+    values: Array  # deformations of the p outputs, then the outputs, at these times, (steps + 1, 2 p) [m, rad]
 
 
 class ReducedRuns:
-    """Reduced models of one mesh and step; the full run is made again when the cache lacks a point. Collective."""
+    """Reduced models of one mesh and step; the full run is made again when the cache lacks a point. Collective.
+
+    Args:
+        setting: mesh, order, steps and solver of the full run.
+        runs: full runs and their cache.
+        truth: reference solution that errors refer to.
+    """
 
     def __init__(self, setting: Setting, runs: FullRuns, truth: ReferenceSolution) -> None:
         self.scene, self.setting, self.runs, self.truth = runs.scene, setting, runs, truth
@@ -61,7 +67,7 @@ class ReducedRuns:
         return self._full
 
     def points(self, name: str, sizes: Sequence[int]) -> list[ReducedPoint]:
-        """Every N of one basis."""
+        """A point for every N of ``sizes`` with the basis ``name`` of ``[reduction]``."""
         section = self.scene.reduction.model_copy(update={"N": list(sizes)})
         key = {
             "method": name, "N": list(sizes), "inner": section.inner, "engine": section.engine,
@@ -78,6 +84,7 @@ class ReducedRuns:
         return [self._point(name, model) for model in models]
 
     def _point(self, name: str, model: TimedModel) -> ReducedPoint:
+        """The point of one model, with errors against reference and full run."""
         full = self.timed
         series = Series(model.times, model.values, full.dimension)
         finite = bool(np.isfinite(series.values).all())
@@ -115,7 +122,7 @@ def _timed_model(model: ReducedModel, point: Point, against: FullRun, probe: Pro
 
 
 def _steps(model: ReducedModel, against: FullRun) -> Array:
-    """Seconds of single steps, called one by one as a control loop would."""
+    """Wall time of each of CALLS steps, called one by one as a control loop would, (CALLS,) [s]."""
     step = Stepper(prepared(propagator(model.at(), against.dt), None, False))
     force, stamps = against.force, np.empty(CALLS)
     for k in range(CALLS):

@@ -61,7 +61,7 @@ class GainReference:
 class Refusal:
     """Why a scene has no answer; empty when it has."""
 
-    reason: str
+    reason: str  # why there is no reference
 
 
 class ControlRuns:

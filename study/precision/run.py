@@ -58,10 +58,11 @@ def run_study(
     request = Request(tolerance, budget, tuple(questions or ()))
     scene = session.scene()
     scene.refuse_contact("study")
+    scene.refuse_frame("study")
     if scene.effects.finite_strain is not None:
         raise SceneError(
             f"{path}: study compares methods of linear elasticity; set effects.finite_strain to false, or run reduce, "
-            "which knows models of finite strain"
+            "which has models of finite strain"
         )
     with session.progress(TaskProgressColumn()) as bar:
         task = bar.add_task("study", total=1.0)

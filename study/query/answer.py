@@ -41,7 +41,7 @@ class CertifiedAnswer:
         if c.passed:
             return ""
         ending = (
-            "--fallback full runs the full model, --allow shows the answer all the same" if self.run is None
+            "--fallback full runs the full model, --allow prints the answer nevertheless" if self.run is None
             else "the full model ran instead" if self.full else "it is shown because --allow was given"
         )  # fmt: skip
         return f"The error {c.claim(percent(c.reduction))}, which is above the tolerance {c.tolerance:g}; {ending}."
@@ -81,8 +81,8 @@ class QueryResult:
     """All answers to one query."""
 
     path: Path  # file of the certified model
-    model: CertifiedModel
-    each: Sequence[CertifiedAnswer]
+    model: CertifiedModel  # model that answered
+    each: Sequence[CertifiedAnswer]  # answers in the order of the parameters
     seconds: float  # of the reduced model
     many: bool  # by a table of parameters
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from softgrasp.reduction import NORMS, Certificate, ParameterDomain
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult, answer_rows
-from softgrasp.study.report import Page, Section, Table, captioned, listed, percent
+from softgrasp.study.report import Page, Section, Table, captioned, in_words, percent
 from softgrasp.study.shell import Session
 
 CAPTIONS = {
@@ -90,10 +90,10 @@ def _summary(answer: CertifiedAnswer, seconds: float) -> list[str]:
     off = [] if c.time_step is None else [f"that of the time step is about {percent(c.time_step)}"]
     off += [f"that of the mesh about {percent(c.mesh.largest)} of the deformation"] if c.mesh is not None else []
     error = f"The error of the reduction {c.claim(percent(c.reduction))}"
-    error += f"; {listed(off)}, by estimates." if off else "; those of time step and mesh are not known."
+    error += f"; {in_words(off)}, by estimates." if off else "; those of time step and mesh are not known."
     if answer.run is None:
         return [error, f"{at} the certified model refuses to answer."]
-    ends = listed([f"{name} at {end:.4g} m" for name, end, *_ in answer.outputs()])
+    ends = in_words([f"{name} at {end:.4g} m" for name, end, *_ in answer.outputs()])
     took = "" if answer.full else f", in {1e3 * seconds:.3g} ms with its error"
     within = [] if answer.warnings or c.tolerance is None else [f"This is within the tolerance {c.tolerance:g}."]
     return [error, f"{at} the {answer.source} ends with {ends}{took}.", *within]

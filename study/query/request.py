@@ -99,13 +99,13 @@ def drive_of(model: CertifiedModel, motion: Path | None = None, dt: float | None
         runs: that are to be made with it.
 
     Raises SceneError: the file does not fit; dt is not positive, too long, or so short that the memory does not hold
-        the runs; or the model holds no motion, or one without its time law.
+        the runs; or the model contains no motion, or one without its time law.
     """
     own = model.drive
     if dt is not None and not (math.isfinite(dt) and dt > 0):
         raise SceneError(f"--dt {dt:g}: the time step must be a positive number of seconds")
     if own is None:
-        raise SceneError("the model holds no motion; reduce its scene again")
+        raise SceneError("the model contains no motion; reduce its scene again")
     profile, M_hand = own.profile, model.fine.parts["M_hand"]
     if motion is not None:
         table = read_csv(motion, len(M_hand), key="--motion")
@@ -113,7 +113,7 @@ def drive_of(model: CertifiedModel, motion: Path | None = None, dt: float | None
         profile = Profile(kind, float(table[0][-1]), np.zeros(len(M_hand)), 1.0, table)
     if profile is None and dt is not None:
         raise SceneError(
-            "--dt: the file of the model is of an earlier version and holds its motion at one step alone; "
+            "--dt: the file of the model is of an earlier version and contains its motion at one step alone; "
             "reduce its scene again, or give the motion with --motion"
         )
     step, end = own.dt if dt is None else dt, own.dt * own.steps if profile is None else profile.end

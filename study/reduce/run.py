@@ -16,6 +16,7 @@ from softgrasp.study.shell import Flags, Session, folder_lock
 def check_scene(scene: Scene) -> tuple[str, ...]:
     """Methods of the scene. Raises SceneError: it keeps no snapshots for a basis. BasisError: a method is unknown."""
     scene.refuse_contact("a reduced model")
+    scene.refuse_frame("a reduced model")
     if scene.output.snapshots not in ("auto", "memory"):
         raise SceneError(
             f"output.snapshots is '{scene.output.snapshots}'; it must be 'memory' for a reduction, which builds its "

@@ -54,8 +54,8 @@ class SpeedUp:
 class FullTimes:
     """Processor time of the full model [s]: the steps of a run alone, and the set-up with its factorisation before."""
 
-    steps: float
-    factor: float
+    steps: float  # processor time of all steps of a run [s]
+    factor: float  # processor time of set-up and factorisation [s]
 
     def against(self, p: Timed) -> SpeedUp:
         """What a reduced model gains."""

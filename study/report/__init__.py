@@ -15,12 +15,14 @@ if TYPE_CHECKING:
         Table,
         captioned,
         entry,
-        listed,
+        in_words,
         percent,
         show_sections,
         table_of,
     )
+    from softgrasp.study.report.equation import control_equation
     from softgrasp.study.report.files import to_json, write_json, write_scene
+    from softgrasp.study.report.origin import command_line
     from softgrasp.study.report.page import EQUATION, of_scene, write_report
 else:
     __getattr__, __dir__ = face(__name__)

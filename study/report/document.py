@@ -109,9 +109,9 @@ class Table:
 class Page:
     """One document: what a command prints, and writes beside result.json."""
 
-    title: str
+    title: str  # title of the page
     summary: Sequence[str]  # three sentences that say what came out
-    sections: Sequence[Section] = ()
+    sections: Sequence[Section] = ()  # sections in their order
     tables: Mapping[str, Table] = field(default_factory=dict)  # by the name of its CSV file
     files: Sequence[Path] = ()  # written already: pictures and fields
     options: str = ""  # of the command line, for the page's last line: " --tolerance 1e-2"
@@ -200,11 +200,11 @@ def _show_table(console: Console, part: Section) -> None:
     console.print(table)
     left = {"row": len(part.rows) - len(rows), "column": len(header) - len(cut.header)}
     if any(left.values()):
-        more = listed([counted(count, f"more {what}") for what, count in left.items() if count])
+        more = in_words([counted(count, f"more {what}") for what, count in left.items() if count])
         console.print(f"... and {more}", style="dim")
 
 
-def listed(names: Sequence[str]) -> str:
+def in_words(names: Sequence[str]) -> str:
     """Names as one reads them: a, b and c."""
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]])) or "none"
 

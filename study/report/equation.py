@@ -15,6 +15,7 @@ from markupsafe import Markup, escape
 from softgrasp.fem import Scene, layered
 
 PLAIN = (  # pattern of LaTeX, what a terminal shows
+    (r"\\dot \\Omega", "Omega'"), (r"\\times", "x"),
     (r"\\ddot (\w(_\w)?)", r"\1''"), (r"\\dot (\w(_\w)?)", r"\1'"), (r"\^\\top", "'"), (r"\\text|[\\${}]", ""),
 )  # fmt: skip
 FEEDBACK = (
@@ -55,6 +56,8 @@ class Equation:
         """A plain equation in blocks, as it is stepped, and what the symbols are."""
         lines = []
         for title, rows in (("in blocks:", self.blocks), ("stepped as:", self.stepped)):
+            if not rows:
+                continue
             wide = 1 + max(len(name) for name, _, _ in rows)
             lines.append(title)
             for name, *sides in rows:
@@ -121,6 +124,8 @@ def equation(scene: Scene) -> Equation:
 
     fall = r"(\ddot q_s - g)" if heavy else r"\ddot q_s"
     drag = (r"$- \alpha G \dot q_s$",) if dragged else ()
+    if effects.frame is not None:
+        return _turning_equation(scene, free, damped, heavy)
     inner = "$f(z)$" if effects.finite_strain else "$K_{ee} z$"
     left = (r"$M_{ee} \ddot z$", *((r"$D_{ee} \dot z$",) if damped else ()), inner)
     rows = [("tissue", left, (f"$-G {fall}$", *drag))]
@@ -137,6 +142,49 @@ def equation(scene: Scene) -> Equation:
     return Equation(blocks, tuple(rows), _definitions(scene, dragged, free))
 
 
+def _turning_equation(scene: Scene, free: bool, damped: bool, heavy: bool) -> Equation:
+    """The equation in the frame of a hand that turns by any angle."""
+    effects = scene.effects
+    inner = "$f(z)$" if effects.finite_strain else "$K_{ee} z$"
+    fall = r"(a - Q^\top g)" if heavy else "a"
+    left = (
+        r"$M_{ee} \ddot z$", r"$2 \Omega \times M_{ee} \dot z$",
+        r"$(\dot \Omega \times + \Omega \times \Omega \times) M_{ee} z$",
+        *((r"$D_{ee} \dot z$",) if damped else ()), inner,
+    )  # fmt: skip
+    load = (f"$-G_t {fall}$", r"$- G_r \dot \Omega$", r"$- S : (\Omega \times)^2$")
+    rows: list[tuple[str, tuple[str, ...], tuple[str, ...]]] = [("tissue", left, load)]
+    momenta = (r"$\dot P$", r"$\dot L + \dot p \times P$")
+    weigh = [
+        name
+        for name, on in (("hand", effects.gravity and effects.gravity.hand_weight), ("tissue", effects.reaction))
+        if on
+    ]
+    weight = ("$F_g$",) if heavy and weigh else ()
+    if free:
+        rows.append(("hand", momenta, ("$u(t)$", *weight)))
+    else:
+        rows.append(("hand", ("$[p, Q]$",), (_motion(scene),)))
+        if effects.reaction:
+            rows.append(("required force", ("$u$",), (*momenta, *(f"$- {w[1:]}" for w in weight))))
+    finite = effects.finite_strain
+    where = [
+        *([] if finite is None else [rf"$f(z) = dW/dz$, $W(F)$ {finite.law}, $F = I + \text{{grad }}z$"]),
+        "$q_s = [p, \\theta]$: displacement of the reference point and rotation vector of $Q$, any angle",
+        "$z$: displacement of the tissue against the hand, in its axes; a point at $r$ goes to $p + Q (r + z)$",
+        r"$a = Q^\top \ddot p$, $\Omega$: acceleration and angular velocity of the hand in its axes",
+        r"$G = [G_t, G_r] = M_{es} + M_{ee} T$, $S_{kl} = \int \rho \phi_k r_l$: inertia loads of a rigid turn",
+        r"$P$, $L$: momenta of the hand"
+        + (
+            " and the tissue, $L$ about the reference point" if effects.reaction else ", which does not feel the tissue"
+        ),
+    ]
+    if weight:
+        where.append(f"$F_g$: weight of the {' and the '.join(weigh)}, and its torque")
+    damping = [text for text in _definitions(scene, False, free) if text.startswith(("$D_{ee}", "$u(t)$", "$K_{ee}"))]
+    return Equation((), tuple(rows), (*where, *(text.split(", $D_{es}")[0] for text in damping)))
+
+
 def _motion(scene: Scene) -> str:
     motion = scene.motion
     if motion.profile == "quintic":
@@ -144,16 +192,24 @@ def _motion(scene: Scene) -> str:
     return "cubic spline through the csv table, at rest at both ends" if motion.profile == "csv" else "$0$"
 
 
+def _own_parts(scene: Scene) -> str:
+    """What an own energy adds to the stiffness, in words."""
+    if scene.tissue.energy is None:
+        return ""
+    return f" and the parts of the other parameters of {scene.tissue.energy}, all of its tangent at rest"
+
+
 def _definitions(scene: Scene, dragged: bool, free: bool) -> tuple[str, ...]:
     effects, layers = scene.effects, "sum over layers of " if scene.tissue.layers else ""
     finite = effects.finite_strain
-    strain = [] if finite is None else [rf"$f(z) = dW/dz$, $W(F)$ {finite.law}, $F = I + \text{{grad }}z$"]
+    law = "" if finite is None else scene.tissue.energy or finite.law
+    strain = [] if finite is None else [rf"$f(z) = dW/dz$, $W(F)$ {law}, $F = I + \text{{grad }}z$"]
     result = [
         *strain,
         "$q_s$: translations" + (" and small angles" if effects.rotation else "") + " of the hand",
         "$z = q_e - T q_s$: displacement of the tissue against the rigid motion $T q_s$",
         "$G = M_{es} + M_{ee} T$; $K_{es} = {-K_{ee}} T$",
-        rf"$K_{{ee}} =$ {layers}$\mu K_\mu + \lambda K_\lambda$, $M_{{ee}} =$ {layers}$\rho M_1$",
+        rf"$K_{{ee}} =$ {layers}$\mu K_\mu + \lambda K_\lambda${_own_parts(scene)}, $M_{{ee}} =$ {layers}$\rho M_1$",
     ]
     if effects.reaction:
         result.append(

@@ -13,7 +13,7 @@ from typing import Any
 from mpi4py import MPI
 from slepc4py import SLEPc
 
-from softgrasp import PACKAGE, package_version
+from softgrasp import PACKAGE, __version__
 from softgrasp.fem import PETSc, Scene, scene_hash
 
 
@@ -40,7 +40,7 @@ def origin(scene: Scene, ranks: int) -> dict[str, Any]:
     return {
         "scene": scene.name,
         "scene_hash": scene_hash(scene),
-        "version": package_version(),
+        "version": __version__,
         "ranks": ranks,
         "machine": machine(),
     }
@@ -67,7 +67,7 @@ def made_with(result: Mapping[str, Any]) -> list[tuple[str, Any]]:
 def versions() -> list[tuple[str, str]]:
     """Versions of this program and of what its numbers come from."""
     commit = _commit(PACKAGE.parent / ".git")
-    rows = [("softgrasp", package_version() + (f", commit {commit}" if commit else ""))]
+    rows = [("softgrasp", __version__ + (f", commit {commit}" if commit else ""))]
     for name, distributions in PACKAGES.items():
         installed = [text for distribution in distributions if (text := _version(distribution))]
         rows += [(name, installed[0])] if installed else []

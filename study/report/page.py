@@ -14,7 +14,7 @@ from markupsafe import Markup
 from PIL import Image
 
 from softgrasp.fem import Scene, note, resolved_toml
-from softgrasp.study.report.document import NUMBERS, Page, Section, cell_text, listed
+from softgrasp.study.report.document import NUMBERS, Page, Section, cell_text, in_words
 from softgrasp.study.report.equation import equation
 from softgrasp.study.report.origin import made_with
 
@@ -114,7 +114,7 @@ def write_report(
         words=words_of(text),
         files=[file.relative_to(path.parent).as_posix() for file in files if file.is_relative_to(path.parent)],
         scene="" if scene is None else resolved_toml(scene).strip(),
-        how=HOW.format(numbers=page.numbers or listed(["result.json", *page.tables])),
+        how=HOW.format(numbers=page.numbers or in_words(["result.json", *page.tables])),
     )
     if address := outside(html):
         raise ValueError(f"the page needs more than itself: {address[0]}")

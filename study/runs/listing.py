@@ -17,7 +17,7 @@ from rich.console import Console
 
 from softgrasp.fem import SceneError, counted, no_pipe, parse_toml, read_text
 from softgrasp.fem.scene.text import LARGEST
-from softgrasp.study.report import Page, Section, Table
+from softgrasp.study.report import Page, Section, Table, in_words
 from softgrasp.study.shell import Session, folder_lock, read_result
 
 ALIKE = 1e-12  # relative difference below which two numbers count as equal: rounding
@@ -94,8 +94,8 @@ def compare(a: Path, b: Path) -> Comparison:
     results = []
     for folder in (a, b):
         if not (result := read_result(folder)):
-            what = "holds no result of softgrasp" if (folder / "result.json").exists() else "is not there"
-            raise SceneError(f"{folder}/result.json {what}; name folders that `softgrasp list` shows")
+            what = "contains no result of softgrasp" if (folder / "result.json").exists() else "is not there"
+            raise SceneError(f"{folder}/result.json {what}; name folders that `softgrasp list` prints")
         results.append(_flat(folder / "result.json", result))
     scenes = [_scene(folder / "scene.toml") for folder in (a, b)]
     names = list(dict.fromkeys([*scenes[0], *scenes[1]]))
@@ -180,7 +180,7 @@ def apart(traces: tuple[list[str], np.ndarray, np.ndarray] | None) -> str:
     for name, size in zip(names[1:], np.nanmax(np.abs(a - b), axis=0)[1:], strict=True):
         unit = name.rpartition("[")[2].rstrip("]")
         most[unit] = max(most.get(unit, 0.0), float(size))
-    return f"The trajectories differ by at most {' and '.join(f'{size:.2g} {unit}' for unit, size in most.items())}."
+    return f"The trajectories differ by at most {in_words([f'{size:.2g} {unit}' for unit, size in most.items()])}."
 
 
 @folder_lock()

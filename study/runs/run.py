@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem import SceneError
-from softgrasp.study.report import SHOWN, Page, Section, Table
+from softgrasp.study.report import SHOWN, Page, Section, Table, percent
 from softgrasp.study.report.origin import origin
 from softgrasp.study.runs.sweep import METHOD, Sweep, SweepPoint, axis_label, parse_axes, run_sweep_points
 from softgrasp.study.shell import Session, folder_lock
@@ -87,7 +87,8 @@ def run_sweep(
     notes = [f"{len(failed)} of {len(points)} points failed: {failed[0]}"] if failed else []
     if (worst := max(point.numbers.get("error_deformation") or 0.0 for point in points)) > COARSE:
         notes.append(
-            f"The reduced model has an error of {worst:.0%} at an end of the sweep; use --reduced with more columns."
+            f"The reduced model has an error of {percent(worst)} at an end of the sweep; "
+            "use --reduced with more columns."
         )
     result = {"command": "sweep", **origin(scene, comm.size), "reduced": reduced}
     result |= {"points": [point.row() for point in points], "warnings": notes}

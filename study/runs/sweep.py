@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp import package_version
+from softgrasp import __version__
 from softgrasp.fem import Model, RunOptions, Scene, Trajectory, adapt, note, remove_own, scene_hash, simulate
 from softgrasp.fem.errors import Interrupted, SceneError, SoftgraspError, shortened
 from softgrasp.fem.labelled import table
@@ -110,9 +110,9 @@ class Sweep:
 class SweepPoint:
     """One point: the values of its keys, and its numbers or why there are none."""
 
-    values: dict[str, float]
+    values: dict[str, float]  # value of each key
     numbers: dict[str, float | None]  # lag and end of each output, energy drift or error of the reduced model, seconds
-    reason: str = ""
+    reason: str = ""  # why there are no numbers, else empty
 
     def row(self) -> dict[str, Any]:
         """The keys of result.json."""
@@ -276,7 +276,7 @@ def sweep(scene: str | Path, values: Mapping[str, Sequence[float]], *, N: int | 
 
 
 def _keys(sweep: Sweep, scenes: Sequence[Scene]) -> list[str]:
-    return [f"{scene_hash(scene)}-{sweep.N}-{package_version()}" for scene in scenes]
+    return [f"{scene_hash(scene)}-{sweep.N}-{__version__}" for scene in scenes]
 
 
 def read_points(sweep: Sweep, out: Path) -> dict[str, SweepPoint]:

@@ -78,8 +78,8 @@ def _settle(out: Path, wanted: tuple[str, str], inputs: list[Path], empty: bool)
         if owner not in (None, wanted):
             of = f" on {owner[1]}" if owner and owner[1] else ""
             raise SceneError(
-                f"--out {out}: it holds the results of {owner[0] if owner else ''}{of}; name another folder, or remove "
-                "them with --empty"
+                f"--out {out}: it contains the results of {owner[0] if owner else ''}{of}; name another folder, or "
+                "remove them with --empty"
             )
         return
     if not known:

@@ -17,10 +17,8 @@ from rich.padding import Padding
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from softgrasp.fem import Model, Scene, build, find_scene, load_scene_collective, raise_on_all_ranks
-from softgrasp.fem.owned import follow
-from softgrasp.study.report import Page, Table, show_sections, write_json, write_report, write_scene
-from softgrasp.study.report.origin import command_line
+from softgrasp.fem import Model, Scene, build, find_scene, follow, load_scene_collective, raise_on_all_ranks
+from softgrasp.study.report import Page, Table, command_line, show_sections, write_json, write_report, write_scene
 from softgrasp.study.shell.folder import claim, files_of, read_result, remove_files
 
 
@@ -36,13 +34,13 @@ class Flags(TypedDict, total=False):
 class Session:
     """What a command was called with."""
 
-    command: str
+    command: str  # name of the command
     path: Path  # scene file
     overrides: Sequence[str]  # arguments of ``--set``
     out: Path  # folder of the results
     console: Console  # writes on rank 0 only
     quiet: bool = False  # no progress bars
-    pictures: bool = True
+    pictures: bool = True  # whether pictures are drawn
     empty: bool = False  # remove what an earlier run has left in the folder
     writes: bool = True  # False: print only
     begin: float = field(default_factory=time.perf_counter)  # [s]

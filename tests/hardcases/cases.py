@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from softgrasp import package_version
+from softgrasp import __version__
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import PETSc, to_scipy
@@ -113,9 +113,9 @@ class Family:
 class FamilyResult:
     """A family that was run: its cases and the seconds they took."""
 
-    family: Family
-    cases: tuple[HardCase, ...]
-    seconds: float
+    family: Family  # the family that was run
+    cases: tuple[HardCase, ...]  # its cases in their order
+    seconds: float  # wall time of all its cases [s]
 
     @property
     def counts(self) -> dict[str, int]:
@@ -141,8 +141,8 @@ class FamilyResult:
 class HardCaseResult:
     """All families that were run; ``quick``: the quick half of each."""
 
-    families: tuple[FamilyResult, ...]
-    quick: bool
+    families: tuple[FamilyResult, ...]  # results in the order of the families
+    quick: bool  # whether only the quick half was run
 
     @property
     def counts(self) -> dict[str, int]:
@@ -168,7 +168,7 @@ class HardCaseResult:
 
     def to_dict(self) -> dict[str, Any]:
         """What result.json holds."""
-        head = {"command": "hardcases", "version": package_version(), "machine": machine(), "quick": self.quick}
+        head = {"command": "hardcases", "version": __version__, "machine": machine(), "quick": self.quick}
         verdict = {"ok": not self.failed, **self.counts, "failed": self.failed}
         families = {f.family.name: f.to_dict() for f in self.families}
         return dict(to_json({**head, **verdict, "families": families, "time": {"total": self.seconds}}))

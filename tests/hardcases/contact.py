@@ -102,6 +102,9 @@ CASES: tuple[tuple[str, str, tuple[str, ...], bool], ...] = (
     ("three equal tables", f"{TABLE}, {TABLE}, {TABLE}", (), True),
     ("two discs on the same node", "{kind='disc', center=[0.4, -0.53], radius=0.5}, "
      "{kind='disc', center=[0.6, -0.53], radius=0.5}", (), True),
+    ("friction of 100 on a slope", "{kind='halfspace', normal=[0.3, 1], offset=-0.03, friction=100.0}", (), True),
+    ("finite strain, block falls on a corner", "{kind='halfspace', normal=[0.3, 1], offset=-0.03}",
+     ("effects.finite_strain={}",), True),
     ("steps of Courant number 10", TABLE, ("time.steps=20", "time.end=4.0"), True),
     ("steps of Courant number 0.01", TABLE, ("time.steps=5000",), True),
 )  # fmt: skip

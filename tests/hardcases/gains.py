@@ -110,7 +110,7 @@ def worst_part_error(K: Array, exact: Array, n_s: int) -> float:
 class GainBounds:
     """Bounds on :func:`worst_part_error`, to first order."""
 
-    problem: RiccatiProblem
+    problem: RiccatiProblem  # plant and weights
     exact: Array  # gain, (m, states)
 
     @cached_property

@@ -96,11 +96,11 @@ def resonance_rows(quick: bool) -> Iterator[HardCase]:
 class Held:
     """A loop under the optimal gain that samples, holds and is late."""
 
-    problem: RiccatiProblem
+    problem: RiccatiProblem  # plant and weights
     tick: float  # between two samples [s]
     delay: int  # ticks from a sample to its load
     per_tick: int = 4  # steps
-    ticks: int = 200
+    ticks: int = 200  # number of ticks of the run
 
     @property
     def dt(self) -> float:

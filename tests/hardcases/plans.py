@@ -8,7 +8,6 @@ from functools import cache
 import numpy as np
 
 from softgrasp.fem.model.build import Stopwatch
-from softgrasp.lqr.constrained.least_distance import nearest
 from softgrasp.lqr.design.constrained import PlannedControl, plan_control
 from softgrasp.lqr.design.feedback import design
 from softgrasp.lqr.design.observer import ObservedControl, observe
@@ -16,6 +15,7 @@ from softgrasp.lqr.observer.judge import loop_map
 from softgrasp.lqr.observer.reduced import reduced_filter
 from softgrasp.lqr.observer.sensors import make_disturbance
 from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.program.least_distance import nearest
 from tests.hardcases.cases import Family, HardCase, Outcome, here, make, textbook
 
 BODY = ("tissue.cells=[2, 4]", "control.constraints.N=14", "control.constraints.parts=4")
@@ -27,7 +27,7 @@ DISC = "{kind='disc', center=[3.4, 1.2], radius=0.7}"
 def planned(*changes: str) -> PlannedControl:
     """The plan of the paper's scene past other obstacles, on a coarse mesh."""
     model = make("paper_obstacle", *BODY, *changes)
-    return plan_control(design(model), Stopwatch(model.system.layout.comm))
+    return plan_control(design(model), Stopwatch(model.system.layout.comm), online=False)
 
 
 def depth(*changes: str) -> float:
@@ -64,6 +64,15 @@ PLANS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("hand that feels the tissue", (f"obstacle=[{WALL}]", "effects.reaction=true"), None),
     ("hand that turns", (f"obstacle=[{WALL}]", "effects.rotation=true", "hand.inertia=5.0",
                        "motion.target=[5.0, 3.0, 0.0]", "control.outputs=[{kind='hand'}]"), None),
+    ("wall with a micrometre more than the margins", (
+        "obstacle=[{kind='halfspace', normal=[-1, 0], offset=-6.001001}]", "control.constraints.margin=1e-3",
+    ), 0.0),
+    ("wall with a micrometre less", (
+        "obstacle=[{kind='halfspace', normal=[-1, 0], offset=-6.000999}]", "control.constraints.margin=1e-3",
+    ), None),
+    ("body that sags by its weight", (
+        f"obstacle=[{WALL}]", "effects.gravity=[0, -0.1]", "time.start='equilibrium'",
+    ), 0.0),
 )  # fmt: skip
 
 

@@ -35,12 +35,12 @@ BYERS = "as many roundings as the Hamiltonian matrix has rows, times the conditi
 class Example:
     """A'X + XA - XBR^{-1}B'X + C'QC = 0 with its stabilising solution X [BLM95]."""
 
-    A: Array
-    B: Array
-    C: Array
-    Q: Array
-    R: Array
-    X: Array
+    A: Array  # state matrix, (n, n)
+    B: Array  # input matrix, (n, m)
+    C: Array  # output matrix, (p, n)
+    Q: Array  # weight of the outputs, (p, p)
+    R: Array  # weight of the inputs, (m, m)
+    X: Array  # stabilising solution, (n, n)
 
     @property
     def graded(self) -> Example:

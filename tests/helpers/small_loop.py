@@ -1,4 +1,4 @@
-"""The closed loop of a reduced system by plain midpoint steps, to compare the full loop and controllers with."""
+"""The closed loop of a reduced system by plain midpoint steps, and the full states and gains of reduced ones."""
 
 from __future__ import annotations
 
@@ -11,6 +11,22 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.reduced import ReducedSystem
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.loop.cost import accumulated_cost
+from softgrasp.lqr.loop.small import Shapes
+from softgrasp.lqr.plant.gain import Gain, PlantState
+from softgrasp.lqr.plant.problem import RiccatiProblem
+
+
+def expand(shapes: Shapes, problem: RiccatiProblem, x: Array) -> PlantState:
+    """The full state V x of a reduced one."""
+    n_s, k = problem.layout.n_s, shapes.V.shape[1]
+    q, v, eta, rate = np.split(np.asarray(x), [n_s, 2 * n_s, 2 * n_s + k])
+    return PlantState(q, v, shapes.V @ eta, shapes.V @ rate)
+
+
+def expand_gain(shapes: Shapes, problem: RiccatiProblem, K: Array) -> Gain:
+    """The gain on the full state that is u = K [q_s, v_s, W'z, W'v_z]."""
+    n_s, k = problem.layout.n_s, shapes.V.shape[1]
+    return Gain(K[:, : 2 * n_s], shapes.W @ K[:, 2 * n_s : 2 * n_s + k].T, shapes.W @ K[:, 2 * n_s + k :].T)
 
 
 class SmallRun(NamedTuple):

@@ -146,7 +146,8 @@ def test_two_runs_are_listed_and_compared(tmp_path: Path) -> None:
     assert numbers["output_final[0]"][:2] == tuple(r["output_final"][0] for r in results)
     assert "n_e" not in numbers
     assert not compare(tmp_path / "a", tmp_path / "a").numbers.rows
-    assert apart(compare(tmp_path / "a", tmp_path / "a").traces) == "The trajectories differ by at most 0 m and 0 N."
+    same = apart(compare(tmp_path / "a", tmp_path / "a").traces)
+    assert same == "The trajectories differ by at most 0 m, 0 N and 0 J."
     assert apart((["t [s]", "x [m]", "turn [rad]"], np.eye(3), np.diag([1.0, 3.0, -1.0]))) == (
         "The trajectories differ by at most 2 m and 2 rad."
     )
@@ -249,7 +250,7 @@ def test_a_foreign_result_does_not_end_the_list(tmp_path: Path) -> None:
     runs, foreign = runs_below(tmp_path)
     assert {Path(row[0]).name for row in runs.rows} == {"0", "5"}
     assert {file.parent.name for file in foreign} == {"1", "2", "3", "4", "6"}
-    with pytest.raises(SceneError, match=r"2/result\.json holds no result of softgrasp"):
+    with pytest.raises(SceneError, match=r"2/result\.json contains no result of softgrasp"):
         compare(tmp_path / "0", tmp_path / "2")
 
 

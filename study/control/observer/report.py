@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from softgrasp.fem.shown import counted
+from softgrasp.fem.shown import counted, percent
 from softgrasp.study.control.observer.result import ObservedStudy
-from softgrasp.study.report.document import Section, listed
+from softgrasp.study.report.document import Section, in_words
 
 SAMPLES = ("sample", "standard deviation", "with what the filter leaves out")
 OUTPUTS = ("output", "estimate [m, rad]", "by the full filter [m, rad]", "from the target [m, rad]")
@@ -39,8 +39,8 @@ def sentence(study: ObservedStudy) -> str:
     judged, N = study.observed.judged, study.observed.reduced.plant.N
     return (
         f"The full plant under the observer of {N} states is stable: its abscissa is {judged.abscissa:.4g} 1/s, with "
-        f"the state known {judged.abscissa_known:.4g} 1/s. What the disturbances cost is {judged.excess:.2%} above the "
-        "least."
+        f"the state known {judged.abscissa_known:.4g} 1/s. With the disturbances the cost is "
+        f"{percent(judged.excess)} above the least."
     )
 
 
@@ -51,7 +51,7 @@ def facts(study: ObservedStudy) -> Iterator[tuple[str, str]]:
     kinds = [counted(markers, "marker")] * (markers > 0) + ["the force on the hand"] * (
         len(found.sensors.sd) > found.sensors.markers.stop
     )
-    yield "measured", listed(["the hand's velocity and pose" if filter_.speed else "the hand's pose", *kinds])
+    yield "measured", in_words(["the hand's velocity and pose" if filter_.speed else "the hand's pose", *kinds])
     yield (
         "samples",
         f"{len(filter_.names)} a tick of {1e3 * found.controller.period:g} ms"

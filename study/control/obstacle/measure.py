@@ -8,9 +8,9 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem import Model, Stopwatch, on_root
-from softgrasp.lqr import Design, Notify, Plan, control_of, plan_control, quadratic_program
-from softgrasp.lqr.constrained.least_distance import nearest
+from softgrasp.lqr import ControlError, Design, Notify, Plan, control_of, plan_control, quadratic_program
 from softgrasp.lqr.design.constrained import run_plan_finite
+from softgrasp.lqr.program.least_distance import nearest
 from softgrasp.study.control.obstacle.result import PlannedStudy
 from softgrasp.study.shell import repeated
 
@@ -29,14 +29,26 @@ def planned_study(
 
     Raises ControlError, SolverError: see :func:`plan_control`.
     """
+    given = control_of(design.model).constraints
+    assert given is not None
+    finite, margin = None, 0.0
     planned = plan_control(design, watch, notify, observed)
-    rows, cold, warm = on_root(design.problem.layout.comm, lambda: times(planned.plan))
-    finite = None
     if model.system.points is not None:
         with watch.stage("plan at finite strain"):
             finite = run_plan_finite(design, model, planned)
+        if given.finite_strain:
+            if finite.reason:
+                raise ControlError(
+                    f"the error of the linear plant cannot be measured: {finite.reason}; leave out "
+                    "control.constraints.finite_strain"
+                )
+            margin = finite.error
+            planned = plan_control(design, watch, notify, observed, estimated=margin)
+            with watch.stage("plan at finite strain"):
+                finite = run_plan_finite(design, model, planned)
+    rows, cold, warm = on_root(design.problem.layout.comm, lambda: times(planned.plan))
     tick = 1 / control_of(design.model).loop.rate
-    return PlannedStudy(planned, design.gain_check.optimal, rows, cold, warm, tick, finite)
+    return PlannedStudy(planned, design.gain_check.optimal, rows, cold, warm, tick, finite, margin)
 
 
 def times(plan: Plan) -> tuple[int, tuple[float, ...], tuple[float, ...]]:

@@ -15,9 +15,7 @@ from scipy.spatial import cKDTree
 from softgrasp.fem import AXES, PictureMesh
 from softgrasp.fem.obstacles.shapes import Shape
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr import PlannedControl
-from softgrasp.lqr.constrained.separation import separate
-from softgrasp.lqr.design.constrained import PlannedTube
+from softgrasp.lqr import PlannedControl, separate
 from softgrasp.study.control.obstacle.result import PlannedStudy
 from softgrasp.study.pictures import draw_obstacle, style
 
@@ -80,28 +78,30 @@ def figure_bodies(planned: PlannedControl, picture: PictureMesh, out_png: Path) 
 def figure_times(study: PlannedStudy, out_png: Path) -> tuple[Path, ...]:
     """Histogram of the times of the quadratic program against tick and interval; PNG and PDF."""
     kinds = {"without a guess": study.seconds_cold, "from a plan nearby": study.seconds_warm}
+    if study.seconds_online:
+        kinds["online, with its judgement"] = study.seconds_online
     grid = study.planned.plan.horizon.plant.grid
     every = np.concatenate([*kinds.values(), [study.tick, grid]])
     edges = np.geomspace(every.min() / 2, 2 * every.max(), 60).tolist()
     with style.paper_style():
         figure, ax = plt.subplots(figsize=(style.WIDTH, 0.35 * style.WIDTH), layout="constrained")
         for i, (name, seconds) in enumerate(kinds.items()):  # the few in front of the many
-            ax.hist(seconds, edges, color=style.CYCLE[i], label=f"{name}, {len(seconds)} solutions", zorder=2 - i)
+            ax.hist(seconds, edges, color=style.CYCLE[i], label=f"{name}, {len(seconds)} solutions", zorder=3 - i)
         top = ax.get_ylim()[1]
         for at, name in ((study.tick, "tick"), (grid, "interval")):
             ax.axvline(at, **LIMIT)
             ax.annotate(name, (at, top), xytext=(3, -2), textcoords="offset points", va="top", color="#666666")
         ax.set(xscale="log", xlabel="time of the quadratic program [s]", ylabel="number")
         ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
         return style.save(figure, out_png)
 
 
-def _deviation(tube: PlannedTube, shape: Shape, body: Array) -> Array:
+def _deviation(covariance: Array, shape: Shape, body: Array) -> Array:
     """Standard deviation of the gap, that of the nearest node along its normal [m], (times,)."""
     normals = np.array([separate(shape, at)[0] for at in body])
     nearest = np.einsum("td,tjd->tj", normals, body).argmin(axis=1)
-    return np.asarray(np.sqrt(np.einsum("td,tde,te->t", normals, tube.covariance[nearest], normals)))
+    return np.asarray(np.sqrt(np.einsum("td,tde,te->t", normals, covariance[nearest], normals)))
 
 
 def figure_gaps(planned: PlannedControl, out_png: Path) -> tuple[Path, ...]:
@@ -115,8 +115,8 @@ def figure_gaps(planned: PlannedControl, out_png: Path) -> tuple[Path, ...]:
         margin = task.clearance + float(np.max(task.error + task.noise, initial=0.0))
         for i, name in enumerate(planned.names):
             gaps.plot(run.times[thin], run.gaps[thin, i], color=style.CYCLE[i % 4], label=name)
-            if planned.tube is not None:
-                room = 3 * _deviation(planned.tube, task.shapes[i], run.body[thin])
+            if planned.online is not None and planned.online.covariance is not None:
+                room = 3 * _deviation(planned.online.covariance, task.shapes[i], run.body[thin])
                 low, high = run.gaps[thin, i] - room, run.gaps[thin, i] + room
                 gaps.fill_between(run.times[thin], low, high, color=style.CYCLE[i % 4], alpha=0.25, lw=0)
         if run.gaps.min(initial=1.0) > 0:

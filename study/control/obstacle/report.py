@@ -12,15 +12,15 @@ from softgrasp.fem import AXES
 from softgrasp.lqr import Plan
 from softgrasp.lqr.design.constrained import FinitePlan
 from softgrasp.study.control.obstacle.result import PlannedStudy
-from softgrasp.study.report import Section, Table, captioned, listed
+from softgrasp.study.report import Section, Table, captioned, in_words, percent
 
 CAPTIONS = {
     "obstacle.png": "The boundary of the body on the full plant under the plan, and the way of its middle; grey and "
-    "dashed: under the optimal feedback, which knows no obstacle, where it is deepest inside.",
+    "dashed: under the optimal feedback, which has no obstacles, where it is deepest inside.",
     "gaps.png": "Gap of the body to every obstacle on the full plant, with a band of three standard deviations where "
     "an observer keeps it on its way under noise. Dashed: clearance and margins, which the reduced plant keeps; the "
     "full plant may use the margins up. Below: force and speed of the hand with their limits.",
-    "times.png": "Times of the quadratic program in Python, without a guess and from the rows that hold a plan nearby, "
+    "times.png": "Times of the quadratic program in Python, without a guess and from the active rows of a plan nearby, "
     "against a tick of the loop and the interval after which the next plan is due.",
 }
 GAPS = ("obstacle", "least gap [m]", "at [s]", "without the plan [m]")
@@ -61,7 +61,8 @@ def sentence(study: PlannedStudy) -> str:
     """What came out."""
     plan = study.planned.plan
     paid = study.planned.runs.planned.cost
-    cost = f"The plan costs {paid:.4g}, {study.excess:.2%} more than the optimal feedback without obstacles and limits."
+    more = f"{percent(study.excess)} more than that of the optimal feedback without obstacles and limits"
+    cost = f"The cost of the plan is {paid:.4g}, {more}."
     if plan.certified:
         return f"The full linear plant keeps every gap and limit under the plan at every time: this is proved. {cost}"
     run = "keeps" if study.kept else "does not keep"
@@ -83,19 +84,24 @@ def facts(study: PlannedStudy) -> list[tuple[str, str]]:
                 "margin for the reduced plant",
                 f"{task.error.max():.3g} m, its error in this plan {runs.reduction_error:.2g} m",
             ),
-            ("margin between two instants", f"{plan.bend:.2g} m where a gap holds the plan"),
-            ("clearance", f"{task.clearance:.3g} m"),
-            *_noisy(study),
+            ("margin between two instants", f"{plan.bend:.2g} m where a gap is active"),
+            ("clearance", f"{task.clearance - study.margin_finite:.3g} m"),
             ("error of the run's own step", f"{runs.step_error:.2g} m, measured against the exact modes"),
             ("cost of a metre of one gap at one instant", f"{plan.multiplier:.3g} at most"),
         ]
+    rows += _noisy(study)
+    if study.margin_finite:
+        text = (
+            f"{study.margin_finite:.3g} m, the error of the linear plant under a plan without it: an estimate, no bound"
+        )
+        rows.append(("margin for finite strain", text))
     if study.finite is not None:
         rows.append(("on the plant of finite strain", _finite(study.finite)))
     rows += [
-        ("excess cost", f"{study.excess:.3%}, of which held forces {study.excess_held:.3%}"),
+        ("excess cost", f"{percent(study.excess)}, of which held forces {percent(study.excess_held)}"),
         ("cost predicted and run", f"{plan.cost:.6g} and {runs.planned.cost:.6g}"),
-        ("largest force", listed([f"{x:.3g} N" for x in np.abs(runs.planned.inputs).max(axis=0)])),
-        ("largest speed", listed([f"{x:.3g} m/s" for x in np.abs(runs.planned.v_s).max(axis=0)])),
+        ("largest force", in_words([f"{x:.3g} N" for x in np.abs(runs.planned.inputs).max(axis=0)])),
+        ("largest speed", in_words([f"{x:.3g} m/s" for x in np.abs(runs.planned.v_s).max(axis=0)])),
         ("rounds and steps of the active set", f"{len(plan.costs)} and {plan.steps} on the way that was chosen"),
     ]
     if len(plan.tried) > 1:
@@ -114,14 +120,32 @@ def facts(study: PlannedStudy) -> list[tuple[str, str]]:
 
 
 def _noisy(study: PlannedStudy) -> list[tuple[str, str]]:
-    """Margin for noise, and the least gap of a run with it."""
-    tube, task = study.planned.tube, study.planned.plan.task
-    if tube is None:
-        return []
-    sd = np.sqrt(np.einsum("jdd->jd", tube.covariance)).max()
+    """Margin for noise, and what the controller that plans again did in its run."""
+    online, task = study.planned.online, study.planned.plan.task
+    if online is None or online.controller.planner is None:
+        return [("planned again online", f"no: {study.planned.reason}")]
+    rows: list[tuple[str, str]] = []
+    noisy = online.covariance is not None
+    if online.covariance is not None:
+        sd = np.sqrt(np.einsum("jdd->jd", online.covariance)).max()
+        text = f"{np.max(task.noise):.3g} m, a node deviates by {sd:.2g} m: an estimate, no bound"
+        rows.append(("margin for noise", text))
+    counts, seconds = study.outcomes, 1e3 * np.array(study.seconds_online)
+    words = (
+        f"{counts['new']} of {len(seconds)} intervals began with a new plan from the estimate, {counts['kept']} went on"
+    )
+    if counts["soft"]:
+        words += f", {counts['soft']} gave up gaps by {max(entry.depth for entry in online.log):.2g} m at most"
+    program = online.controller.planner
     return [
-        ("margin for noise", f"{np.max(task.noise):.3g} m, a node deviates by {sd:.2g} m: an estimate, no bound"),
-        ("least gap of a run with noise", f"{tube.gaps.min():.3g} m, the observer's feedback around the plan"),
+        *rows,
+        ("planned again online", words),
+        ("least gap of that run", f"{online.gaps.min():.3g} m, {'with' if noisy else 'without'} noise"),
+        (
+            "program online",
+            f"{program.count(0)} rows of {study.rows} can be met, {np.median(seconds):.2g} ms in the median and "
+            f"{seconds.max():.2g} ms at most in Python, with the judgement",
+        ),
     ]
 
 
@@ -136,7 +160,7 @@ def _finite(finite: FinitePlan) -> str:
 
 def _held(plan: Plan) -> str:
     """How many rows hold a plan, or that they are exceeded."""
-    return f"{len(plan.active)} of them hold the plan" if plan.depth == 0 else "no forces keep all of them"
+    return f"{len(plan.active)} of them are active" if plan.depth == 0 else "no forces keep all of them"
 
 
 def words(sides: Sequence[int]) -> str:

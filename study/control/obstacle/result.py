@@ -9,6 +9,7 @@ import numpy as np
 
 from softgrasp.lqr import PlannedControl
 from softgrasp.lqr.design.constrained import FinitePlan
+from softgrasp.lqr.program.replan import Outcome
 
 
 @dataclass(frozen=True)
@@ -17,11 +18,25 @@ class PlannedStudy:
 
     planned: PlannedControl  # plan and runs
     optimal_cost: float  # least cost J* of all inputs without obstacles and limits
-    rows: int  # of the quadratic program
+    rows: int  # number of rows of the quadratic program
     seconds_cold: tuple[float, ...]  # time of the quadratic program without a guess [s]
-    seconds_warm: tuple[float, ...]  # time of programs nearby from the rows that hold its solution [s]
+    seconds_warm: tuple[float, ...]  # time of programs nearby from its active rows [s]
     tick: float  # time between two ticks of the loop [s]
     finite: FinitePlan | None = None  # the plan on the plant of finite strain; None where the effect is off
+    margin_finite: float = 0.0  # margin for the error of the linear plant, measured under a plan before [m]
+
+    @property
+    def seconds_online(self) -> tuple[float, ...]:
+        """Time of every plan that was made again in the run from tick to tick, with its judgement [s]."""
+        online = self.planned.online
+        return () if online is None else tuple(entry.seconds for entry in online.log)
+
+    @property
+    def outcomes(self) -> dict[str, int]:
+        """Intervals of that run by what they began with: a new plan, the last one, one that gives up gaps."""
+        online = self.planned.online
+        log = () if online is None else online.log
+        return {kind.name.lower(): sum(entry.outcome is kind for entry in log) for kind in Outcome}
 
     @property
     def excess(self) -> float:
@@ -41,7 +56,8 @@ class PlannedStudy:
     def result(self) -> dict[str, Any]:
         """The key "obstacle" of ``result.json``."""
         plan, runs = self.planned.plan, self.planned.runs
-        task, plant, tube = plan.task, plan.horizon.plant, self.planned.tube
+        task, plant, online = plan.task, plan.horizon.plant, self.planned.online
+        noisy = online is not None and online.covariance is not None
         used = np.abs(runs.planned.inputs).max(axis=0)
         return {
             "names": list(self.planned.names),
@@ -49,12 +65,14 @@ class PlannedStudy:
             "time": runs.planned.times_least.tolist(),
             "gap_min_without_plan": runs.free.least.tolist(),
             "margin": {
-                "clearance": task.clearance,
+                "clearance": task.clearance - self.margin_finite,
+                **({"finite_strain": self.margin_finite} if self.margin_finite else {}),
                 "reduced_plant": float(task.error.max(initial=0.0)),
                 "between_instants": plan.bend,
-                **({} if tube is None else {"noise": float(np.max(task.noise))}),
+                **({"noise": float(np.max(task.noise))} if noisy else {}),
             },
-            **({} if tube is None else {"gap_min_noisy": tube.gaps.min(axis=0).tolist()}),
+            **({"gap_min_noisy": online.gaps.min(axis=0).tolist()} if noisy and online is not None else {}),
+            "online": self._online(),
             "error_of_reduced_plant": runs.reduction_error,
             "error_of_run_step": runs.step_error,
             **({} if self.finite is None else {"finite_strain": _finite(self.finite)}),
@@ -86,6 +104,23 @@ class PlannedStudy:
             "tick": self.tick,
             "time_cold": [float(np.median(self.seconds_cold)), max(self.seconds_cold)],
             "time_warm": [float(np.median(self.seconds_warm)), max(self.seconds_warm)],
+        }
+
+    def _online(self) -> dict[str, Any]:
+        """The key "online" of a plan."""
+        online = self.planned.online
+        if online is None or online.controller.planner is None:
+            return {"reason": self.planned.reason}
+        program, seconds = online.controller.planner, self.seconds_online
+        return {
+            "gap_min": online.gaps.min(axis=0).tolist(),
+            "rows": program.count(0),
+            "rows_most": program.count(program.H),
+            "time": [float(np.median(seconds)), max(seconds)],
+            "steps": [entry.steps for entry in online.log],
+            "depth": max(entry.depth for entry in online.log),
+            **self.outcomes,
+            "reasons": sorted({entry.reason for entry in online.log if entry.reason}),
         }
 
 

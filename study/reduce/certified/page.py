@@ -109,7 +109,7 @@ def sentences(certified: CertifiedModel, check: BoxCheck | None, result: dict[st
         if v.factor is not None:  # null in result.json where there is no estimate
             lines.append(
                 f"In {v.n} random full runs the error was at most {v.factor:.3g} times the estimate; with 95 % "
-                f"confidence it is larger on at most {v.share:.1%} of the box."
+                f"confidence it is larger on at most {percent(v.share)} of the box."
             )
     lines += [
         f"At the scene's own material: {about['own']['sentence']}.",

@@ -184,13 +184,13 @@ Family = tuple[str, bool]
 
 
 def families(full: FullRun, models: Sequence[TestedModel]) -> dict[Family, ModelComparison]:
-    """What the errors of all models are computed from. Collective."""
+    """Comparison with the full run by family of models, made with the largest model of each. Collective."""
     largest = {(m.method.key, m.several): m.model for m in sorted(models, key=lambda m: m.model.N)}
     return {family: comparison_of(model, full) for family, model in largest.items()}
 
 
 def moved(known: dict[Family, ModelComparison], full: FullRun) -> dict[Family, ModelComparison]:
-    """The same at the materials of another run, of the same densities. Collective."""
+    """Comparisons as of :func:`families` with another full run, of the same densities. Collective."""
     system = full.model.system
     places = {family: each.model.at(system.materials) for family, each in known.items()}
     return {f: each.at(places[f], system, full.snapshots, full.energy) for f, each in known.items()}

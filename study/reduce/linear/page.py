@@ -26,8 +26,9 @@ from softgrasp.study.report import Columns, Page, Section, Table, captioned, per
 LEVELS = (1e-1, 1e-2, 1e-3)  # of the error of the deformation, for which the least N is named
 FIRST = ("errors.png", "errors_beyond.png")  # pictures below the summary
 CAPTIONS = {
-    "errors.png": "Error of the deformation of the paper's six methods against N, all columns of V counted. A curve "
-    "is dotted where its model is unstable (crosses). Errors above 1 are drawn at 1.",
+    "errors.png": "Error of the deformation against N, all columns of V counted, of the paper's six methods and of "
+    "Craig-Bampton and PSD SVD-like where they ran. A curve "
+    "is dotted where its model is unstable (crosses). Errors above 100 % are drawn at 100 %.",
     "errors_beyond.png": "The same for the methods beyond the paper, beside its best.",
     "errors_state.png": "Further errors of the paper's six methods: of the state [q_s, v_s, q_e, v_e], which is the "
     "paper's, of [q_s, p_s, q_e, p_e], and of the energy of the tissue.",
@@ -38,8 +39,8 @@ CAPTIONS = {
     "PSD are symplectic or of complex snapshots, each a pair of columns.",
     "modes.png": "First modes of the best method of the paper that keeps the hand apart, and of Craig-Bampton or the "
     "best beyond the paper, scaled to the same largest displacement. Colour: displacement relative to the hand. The "
-    "paper's modes hold absolute displacements of the tissue alone, and columns of their own move the hand: here the "
-    "hand stands where the tissue beside it goes.",
+    "paper's modes contain absolute displacements of the tissue alone, and columns of their own move the hand: here "
+    "the hand follows the tissue beside it.",
     "compare.png": "Reduced bodies under the outline of the full one, at instants of large deformation or error.",
     "compare.gif": "The same in motion.",
 }

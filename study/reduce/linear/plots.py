@@ -59,7 +59,7 @@ def draw(out: Path, sweeps: Sequence[MethodSweep], full: float, views: Views | N
     files: list[Path] = []
     shown = [s for s in sweeps if s.points]
     if paper := of_paper(shown):
-        files += figure_errors(paper, QUANTITIES[:1], out / "errors.png")
+        files += figure_errors([*paper, *best_beyond(shown)], QUANTITIES[:1], out / "errors.png")
         files += figure_errors(paper, QUANTITIES[1:], out / "errors_state.png")
     if len(paper) < len(shown):
         files += figure_errors(further_methods(shown), QUANTITIES[:1], out / "errors_beyond.png")
@@ -83,6 +83,11 @@ def looks(methods: Iterable[str]) -> dict[str, tuple[str, str, str]]:
 def of_paper(sweeps: Sequence[MethodSweep]) -> list[MethodSweep]:
     """The paper's six, as far as they ran."""
     return [s for s in sweeps if s.method.key in PAPER_METHODS and s.points]
+
+
+def best_beyond(sweeps: Sequence[MethodSweep]) -> list[MethodSweep]:
+    """Craig-Bampton and the SVD-like basis, as far as they ran: shown beside the paper's six."""
+    return [s for s in sweeps if s.method.key in ("psd_svd_like", "craig_bampton")]
 
 
 def further_methods(sweeps: Sequence[MethodSweep]) -> list[MethodSweep]:

@@ -71,12 +71,13 @@ def test_what_has_no_observer_is_refused_before_the_riccati_equation(
         control(tmp_path, OBSERVER, "tissue.cells=[30,60]")
 
 
-def test_a_scene_without_the_table_imports_no_observer_and_keeps_its_bits(tmp_path: Path) -> None:
+def test_a_scene_without_tables_imports_neither_plan_nor_observer_and_keeps_its_bits(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from rich.console import Console;"
         "from softgrasp.study.control.run import run_control;"
-        f"run_control(Path('paper_lqr'), Path(sys.argv[1]), {SMALL}, Console(quiet=True), quiet=True, gain_only=True);"
-        "sys.exit(any('observer' in name or 'loop.filter' in name for name in sys.modules))"
+        f"run_control(Path('paper_lqr'), Path(sys.argv[1]), {SMALL}, Console(quiet=True), quiet=True, pictures=False);"
+        "rooms = ('observer', 'loop.filter', 'constrained', 'control.obstacle');"
+        "sys.exit(any(room in name for room in rooms for name in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code, tmp_path / "out"], check=False).returncode == 0
     control(tmp_path / "with", OBSERVER)

@@ -334,7 +334,7 @@ def test_advice_on_a_shipped_scene_can_be_followed(comm: MPI.Intracomm) -> None:
         assert company.together == pytest.approx(named(runs, name, company), rel=1e-9)  # parallel sums, other order
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 def test_a_prescribed_motion_feels_neither_reaction_nor_the_freedom_to_turn(comm: MPI.Intracomm) -> None:
     """So runs that differ in them alone are made once, with all other effects on."""
     model = build(make_scene(QUICK, hand={"inertia": 3.0}), comm=comm)
@@ -539,17 +539,22 @@ def test_switched_off_leaves_a_valid_scene(comm: MPI.Intracomm) -> None:
         motion={"target": [5.0, 3.0, 0.2]},
         control={"R": R},
     )
-    by = {
-        s.name: s for s in switches(scene, SCALES) if s.name not in ("finite_strain", "obstacles")
-    }  # not beside rotation
+    apart = ("finite_strain", "obstacles", "frame")  # the first not beside rotation, the last needs it
+    by = {s.name: s for s in switches(scene, SCALES) if s.name not in apart}
     assert all(s.on for s in by.values())
     for name, s in by.items():
         assert not EFFECTS[name].active(s.other)
-        others = [e for key, e in EFFECTS.items() if key not in (name, "finite_strain", "obstacles")]
+        others = [e for key, e in EFFECTS.items() if key not in (name, *apart)]
         assert all(e.active(s.other) for e in others)
         assert neutral(s.other, name, 2) is None or EFFECTS[name].active(neutral(s.other, name, 2))
     assert by["rotation"].other.control.R == [[1.0, 0.0], [0.0, 2.0]]
     assert by["damping"].other.tissue.layers["low"].beta is None
+    (frame,) = [s for s in switches(by["rotation"].other, SCALES) if s.name == "frame"]
+    assert frame.other is None
+    assert frame.reason == "the hand does not turn"
+    (frame,) = [s for s in switches(scene, SCALES) if s.name == "frame"]
+    assert frame.other is not None
+    assert frame.other.effects.frame == "hand"
     again = by["rotation"].other.changed(lambda table: None)
     assert again == by["rotation"].other
 

@@ -40,6 +40,7 @@ def test_forces_gaps_and_touching_nodes_are_in_the_files(tmp_path: Path) -> None
     assert contact is not None
     keys = result["contact"]["obstacles"]["table"]
     assert keys["force_end"] == ((contact.force[-2, 0] + contact.force[-1, 0]) / 2).tolist()
+    assert result["contact"]["force_end"] == pytest.approx(contact.force_end.sum(axis=0), rel=1e-12)  # order of the sum
     assert keys["nodes_max"] == contact.touching.max() > 0
     header, *rows = (tmp_path / "trajectory.csv").read_text().splitlines()
     names = header.split(",")

@@ -92,9 +92,9 @@ def test_the_force_that_the_motion_takes_is_written(comm: MPI.Intracomm, mpi_tmp
     if comm.rank > 0:
         return
     with (mpi_tmp_path / "trajectory.csv").open() as file:
-        assert file.readline().endswith("force_x [N],force_y [N],force_rz [N m]\n")
-        assert file.readline().endswith("nan,nan,nan\n")  # no step ends at the start
-        forces = np.loadtxt(file, delimiter=",")[:, -3:]
+        first = file.readline().split(",").index("force_x [N]")
+        assert file.readline().split(",")[first : first + 3] == ["nan"] * 3  # no step ends at the start
+        forces = np.loadtxt(file, delimiter=",")[:, first : first + 3]
     peak = json.loads((mpi_tmp_path / "result.json").read_text())["force_peak"]
     assert peak == dict(zip(("x", "y", "rz"), np.abs(forces).max(axis=0).tolist(), strict=True))
     assert f"rz {peak['rz']:.4g} N m" in said

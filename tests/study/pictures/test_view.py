@@ -60,6 +60,31 @@ def test_picture_shows_four_bodies(two_legs: Path, tmp_path: Path) -> None:
 
 
 @needs_pyvista
+def test_obstacles_are_shown_where_they_are() -> None:
+    """Beside a body from 0 to 1: a table half a unit below, a disc that moves, and a ball too far away to be shown."""
+    from softgrasp.fem import Ball, HalfSpace, Obstacle, Polytope
+    from softgrasp.study.pictures.solids import solids
+
+    table = Obstacle("table", "halfspace", HalfSpace(np.array([0.0, 1.0]), -0.2), None)
+    disc = Obstacle("disc", "disc", Ball(np.array([1.1, 0.5]), 0.05), lambda t, order: np.array([t, 0.0]))
+    box = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
+    seen = solids((table, disc), 0.1, box, flat=True)
+    low, high = np.array(seen.bounds).reshape(3, 2).T
+    assert low[1] == pytest.approx(-0.25)  # cut off a quarter of the body beside it
+    assert (low[0], high[0]) == pytest.approx((-0.25, 1.25))
+    assert -0.01 < high[2] < 0  # behind the body
+    only = solids((disc,), 0.1, box, flat=True)
+    assert np.array(only.bounds)[:4] == pytest.approx([1.15, 1.25, 0.45, 0.55], abs=1e-3)  # 96 corners
+    ball = Obstacle("ball", "ball", Ball(np.array([0.0, 0.0, -9.0]), 0.5), None)
+    cube = Obstacle("cube", "box", Polytope.box(np.array([0.2, 0.2, -0.5]), np.array([0.4, 0.4, -0.1])), None)
+    solid = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    assert solids((ball,), 0.0, solid, flat=False) is None
+    assert np.array(solids((ball, cube), 0.0, solid, flat=False).bounds) == pytest.approx(
+        [0.2, 0.4, 0.2, 0.4, -0.25, -0.1]
+    )
+
+
+@needs_pyvista
 def test_refusals(two_legs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -67,7 +92,7 @@ def test_refusals(two_legs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         view(two_legs, "von_mises", None)
     with pytest.raises(SceneError, match=r"ends in \.png"):
         view(two_legs, "von_mises", Path("move.jpg"))
-    with pytest.raises(SceneError, match="--field heat: the files hold displacement, held, layer"):
+    with pytest.raises(SceneError, match="--field heat: the files contain displacement, held, layer"):
         Move(two_legs, "heat")
     with pytest.raises(SceneError, match="has no field files"):
         Move(tmp_path, "von_mises")

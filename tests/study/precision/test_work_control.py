@@ -250,7 +250,7 @@ def test_the_paper_is_named_for_its_own_scene_only() -> None:
     assert "no second method" in told[1]
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 def test_numbers_do_not_depend_on_the_rank_count(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     study = asked(comm, mpi_tmp_path, {"control": SMALL["control"] | {"N": [4, 6]}}, "reduced_riccati")
     whole = make_scene(SMALL, {"control": SMALL["control"] | {"N": [4, 6]}})

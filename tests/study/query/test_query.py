@@ -321,7 +321,7 @@ def test_a_file_of_an_earlier_version_takes_no_other_step(file: Path, tmp_path: 
         write_checksums(data)
     status, _ = ask(old, "lambda=300", "mu=200")
     assert status == 0
-    with pytest.raises(SceneError, match="earlier version and holds its motion at one step alone"):
+    with pytest.raises(SceneError, match="earlier version and contains its motion at one step alone"):
         ask(old, "lambda=300", "mu=200", dt=0.01)
 
 
@@ -398,7 +398,7 @@ def test_a_page_says_what_came_out_and_how_far_it_is_off(file: Path, tmp_path: P
         }
         assert said[kind] in page
         assert (tmp_path / "page" / "answer.csv").exists() == (kind != "refused")
-    with pytest.raises(SceneError, match="it holds the results of query"):
+    with pytest.raises(SceneError, match="it contains the results of query"):
         claim(tmp_path / "page", "simulate", "certified")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS
 from softgrasp.study.reduce.linear.measure import FURTHER, chosen_methods
 from softgrasp.study.reduce.linear.page import error_table, findings, least_size, stability
+from softgrasp.study.reduce.linear.plots import best_beyond
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, best, kept_points, nearest
 from softgrasp.study.report.document import cell_text
 from tests.helpers.models import make_scene
@@ -22,6 +23,11 @@ def test_scene_chooses_methods() -> None:
 
 def point(N: int, error: float, stable: bool = True, online: float = 1e-3) -> Point:
     return Point(N, N, (N,), error, *(5 * [2 * error]), 2.0, 1e-3, online, 0.0 if stable else 1.0, stable)
+
+
+def test_the_first_figure_has_craig_bampton_and_svd_like_beside_the_papers_six() -> None:
+    sweeps = [MethodSweep(METHODS[key], (point(14, 0.1),), {}, ()) for key in (*PAPER_METHODS, *FURTHER)]
+    assert {s.method.key for s in best_beyond(sweeps)} == {"craig_bampton", "psd_svd_like"}
 
 
 def test_choice_of_points() -> None:

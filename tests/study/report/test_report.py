@@ -62,7 +62,10 @@ def test_finite_strain_has_its_energy_in_a_terminal() -> None:
 
 @pytest.mark.parametrize("name", sorted(shipped_scenes()))
 def test_control_has_its_cost_and_riccati_equation(name: str) -> None:
-    rows = control_equation(load_scene(shipped_scenes()[name]))
+    scene = load_scene(shipped_scenes()[name])
+    if scene.effects.frame is not None:
+        pytest.skip("control refuses a hand that turns by any angle")
+    rows = control_equation(scene)
     assert "prescribed" not in " ".join(rows.where)  # a force moves the hand, whatever moves it in `simulate`
     assert any(line.startswith("  hand:   M_hand q_s''") for line in rows.plain().lines())
     html = str(rows.html())
@@ -128,6 +131,23 @@ def browser() -> Iterator[Browser]:
 def test_browser_shows_the_page_without_complaint(browser: Browser, page: Path, width: int) -> None:
     assert faults(browser, page, width, figures=4) == []
     assert browser.ask("document.querySelectorAll('.term').length") > 5
+
+
+def test_a_wide_table_is_stacked_on_a_telephone(browser: Browser, tmp_path: Path) -> None:
+    """A name and its value share a line there; on a desk the columns stand side by side."""
+    header = tuple(f"a long name of column {i}" for i in range(8))
+    section = Section("Many", header=header, rows=[[f"row {k}", *range(7)] for k in range(3)])
+    scene = load_scene(shipped_scenes()["paper_forward"])
+    file = write_report(tmp_path / "r.html", Page("t", (), sections=(section,), command="softgrasp"), scene=scene)
+    widths = "[...document.querySelectorAll('td')].slice(0, 2).map(e => e.getBoundingClientRect().top)"
+    browser.open(file, PHONE, mobile=True)
+    first, second = browser.ask(widths)
+    assert second > first + 10  # [px] one below the other
+    assert browser.ask("getComputedStyle(document.querySelectorAll('td')[1], '::before').content") == f'"{header[1]}"'
+    assert browser.ask("document.querySelector('.wide').scrollWidth <= document.querySelector('.wide').clientWidth")
+    browser.open(file, DESK)
+    first, second = browser.ask(widths)
+    assert first == second
 
 
 def test_browser_prints_the_page(browser: Browser, page: Path, tmp_path: Path) -> None:

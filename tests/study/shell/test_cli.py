@@ -77,29 +77,58 @@ def test_set_changes_the_mesh(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "result.json").read_text())["states"] == 880
 
 
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (("--set", "tissue.cels=[4,8]"), ("tissue.cels", "tissue.cells")),
-        (("--set", "tissue.material.mu=-1.0"), ("tissue.material.mu", "> 0")),
-        (("--set", "time.steps=0"), ("time.steps",)),
-        (("--set", "motion.target=[1.0,2.0,3.0]"), ("motion.target",)),
-        (("--set", "contact.box=[[0.4,0.4],[0.5,0.5]]"), ("contact",)),
-        (("--set", "control.outputs=[{kind='node', point=[9.0,9.0]}]"), ("control.outputs[0].point", "outside")),
-        (("--resume",), ("checkpoint.json", "--resume")),
-    ],
-)
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_wrong_input_is_one_sentence(tmp_path: Path, args: tuple[str, ...], words: tuple[str, ...], ranks: int) -> None:
-    run = softgrasp("simulate", str(FORWARD), "--out", str(tmp_path / "out"), *args, ranks=ranks)
-    assert run.returncode != 0
-    assert "Traceback" not in run.stderr
-    assert "resumed" not in run.stdout
-    message = run.stderr[run.stderr.index("error:") :]
+REFUSED: list[tuple[tuple[str, ...], tuple[str, ...]]] = [
+    (("--set", "tissue.cels=[4,8]"), ("tissue.cels", "tissue.cells")),
+    (("--set", "tissue.material.mu=-1.0"), ("tissue.material.mu", "> 0")),
+    (("--set", "time.steps=0"), ("time.steps",)),
+    (("--set", "motion.target=[1.0,2.0,3.0]"), ("motion.target",)),
+    (("--set", "contact.box=[[0.4,0.4],[0.5,0.5]]"), ("contact",)),
+    (("--set", "control.outputs=[{kind='node', point=[9.0,9.0]}]"), ("control.outputs[0].point", "outside")),
+    (("--resume",), ("checkpoint.json", "--resume")),
+]
+# Command lines one after the other in one process a rank: what each wrote and left, by rank 0.
+IN_TURN = """
+import sys
+from softgrasp.study.cli import main
+for line in sys.argv[1:]:
+    sys.argv[1:] = line.split("\\n")
+    try:
+        main()
+        status = 0
+    except SystemExit as end:
+        status = end.code
+    for stream in (sys.stdout, sys.stderr):
+        stream.write(f"\\n<{status}>\\n" if rank() == 0 else "")
+        stream.flush()
+"""
+
+
+@pytest.fixture(scope="module", params=[1, 2])
+def refusals(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[str, str, Path]]:
+    """Output, errors and folder of each refused command, whose status was 1."""
+    folder = tmp_path_factory.mktemp("refused")
+    outs = [folder / f"out{i}" for i in range(len(REFUSED))]
+    lines = [
+        "\n".join(["simulate", str(FORWARD), "--out", str(out), *args])
+        for out, (args, _) in zip(outs, REFUSED, strict=True)
+    ]
+    code = f"from softgrasp.study.shell.ending import rank{IN_TURN}"
+    run = subprocess.run([*launched(request.param), "-c", code, *lines], cwd=ROOT, capture_output=True, text=True)
+    texts = [re.split(r"\n<(.*)>\n", text) for text in (run.stdout, run.stderr)]
+    assert [text[1::2] for text in texts] == [["1"] * len(REFUSED)] * 2, run.stderr
+    return list(zip(texts[0][:-1:2], texts[1][:-1:2], outs, strict=True))
+
+
+@pytest.mark.parametrize("case", range(len(REFUSED)), ids=[" ".join(args) for args, _ in REFUSED])
+def test_wrong_input_is_one_sentence(refusals: list[tuple[str, str, Path]], case: int) -> None:
+    shown, errors, out = refusals[case]
+    assert "Traceback" not in errors
+    assert "resumed" not in shown
+    message = errors[errors.index("error:") :]
     assert message.count("error:") == 1  # one rank speaks
-    for word in words:
+    for word in REFUSED[case][1]:
         assert word in message, message
-    assert not (tmp_path / "out" / "result.json").exists()
+    assert not (out / "result.json").exists()
 
 
 def test_a_resumed_run_says_from_where_and_what_it_timed(tmp_path: Path) -> None:
@@ -239,7 +268,17 @@ def test_petsc_options_are_read_and_one_that_is_not_is_named(
     page = (ROOT / "docs" / "guide" / "petsc.md").read_text()
     options = re.findall(r'^export PETSC_OPTIONS="(.*)"$', page, re.MULTILINE)[0]
     monkeypatch.setenv("PETSC_OPTIONS", f"{options} -softgrasp_midpont_ksp_view")
-    args = ("simulate", str(FORWARD), "--set", "time.steps=40", "--no-pictures", "--out", str(tmp_path))
+    args = (
+        "simulate",
+        str(FORWARD),
+        "--set",
+        "tissue.cells=[4,8]",
+        "--set",
+        "time.steps=40",
+        "--no-pictures",
+        "--out",
+        str(tmp_path),
+    )
     run = softgrasp(*args, ranks=ranks)
     assert run.returncode == 0
     assert re.search(r"KSP Object: .*\(softgrasp_midpoint_\)", run.stdout)

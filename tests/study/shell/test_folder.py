@@ -69,7 +69,7 @@ def test_a_folder_of_a_stopped_run_is_its_scenes(tmp_path: Path) -> None:
     out = tmp_path / "run"
     run_simulate(shipped_scenes()["paper_forward"], out, SMALL, QUIET, quiet=True, pictures=False, until=10)
     assert not (out / "result.json").exists()
-    with pytest.raises(SceneError, match="it holds the results of simulate on paper_forward"):
+    with pytest.raises(SceneError, match="it contains the results of simulate on paper_forward"):
         run_simulate(shipped_scenes()["paper_lqr"], out, SMALL, QUIET, quiet=True, pictures=False)
     (out / "notes.txt").write_text("mine")
     claim(out, "simulate", "strip", empty=True)
@@ -213,7 +213,7 @@ def test_a_command_inside_another_leaves_the_outer_one_its_folder(tmp_path: Path
     assert not inner.exists()
     with folder_lock():
         claim(outer, "simulate", "block")
-        with pytest.raises(SceneError, match="holds the results of simulate on block"), folder_lock():
+        with pytest.raises(SceneError, match="contains the results of simulate on block"), folder_lock():
             claim(outer, "reduce", "strip")
         assert (outer / LOCK).is_file()
     assert not (outer / LOCK).exists()
