@@ -19,10 +19,13 @@ import pytest
 from mpi4py import MPI
 
 os.environ["MPLBACKEND"] = "Agg"  # before matplotlib: no test needs a display
+for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL"):  # a test's own make must not ask for tokens of the make around us
+    os.environ.pop(name, None)
 
 OWN = MPI.COMM_WORLD.Dup()  # never matches the messages of a test
 OUTCOMES = ("passed", "skipped", "failed")
 SERIAL = {"study", "benchmarks", "hardcases"}  # rooms above lqr
+LINES = 15  # of a failure, when it happens; all of it comes at the end
 LIMIT = float(os.environ.get("MPI_TEST_LIMIT", "30"))  # [s] from one rank's failure to Abort
 
 
@@ -59,6 +62,14 @@ def pytest_runtest_makereport(
         report.outcome = "failed"
         report.longrepr = f"{call.when} differs by rank: {', '.join(outcomes)}"
     return report
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Name a failure when it happens: a run that is cut off later still says what failed."""
+    if report.failed and OWN.rank == 0 and "PYTEST_XDIST_WORKER" not in os.environ:
+        last = "\n".join(report.longreprtext.splitlines()[-LINES:])
+        sys.__stderr__.write(f"\n{report.nodeid} ({report.when}) failed:\n{last}\n")
+        sys.__stderr__.flush()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softgrasp.fem.errors import Paused, SceneError
+from softgrasp.fem.errors import Paused, SceneError, SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.obstacles.coulomb import Coulomb
 from softgrasp.fem.run.contact.friction import FlatFriction
@@ -72,16 +72,20 @@ def test_forces_of_random_problems_meet_coulombs_conditions(mu: float, tangents:
 
 @pytest.mark.parametrize("tangents", [1, 2])
 def test_much_friction_is_found_from_little(tangents: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Loads under which rounds and sweeps from no forces lead nowhere."""
-    grown, grow = list[int](), Coulomb._grow
+    """Loads under which rounds and sweeps from no forces lead nowhere: a tenth of them, rounding decides which."""
+    grown, grow, refused = list[int](), Coulomb._grow, 0
     monkeypatch.setattr(Coulomb, "_grow", lambda *arguments: (grown.append(1), grow(*arguments))[1])
     k, s, mu = 5, 1 + tangents, 10.0
-    for seed in (44, 91):
+    for seed in range(100):
         rng = np.random.default_rng(seed)
         A = rng.standard_normal((s * k + 2, s * k))
         W, q = A.T @ A / k + 0.1 * np.eye(s * k), rng.standard_normal(s * k)
-        check_law(Coulomb(tangents).solve(k, W, q, np.full(k, mu), 1e-13), W, q, mu)
-    assert len(grown) == 2
+        try:
+            check_law(Coulomb(tangents).solve(k, W, q, np.full(k, mu), 1e-13), W, q, mu)
+        except SolverError:
+            refused += 1
+    assert len(grown) - refused >= 4  # 9 and 10 to 11 seen, with the kernels of two kinds of processors
+    assert refused <= 5  # 1 and 2 seen
 
 
 def test_few_other_rows_leave_the_factor() -> None:
