@@ -41,7 +41,7 @@ test: $(STAMP) ## lint, all tests on one rank, those marked `ranks(2)` on 2, tho
 	$(BIN)/mpiexec -n 3 $(BIN)/python -m pytest -q --own-ranks
 
 test-one: $(STAMP)
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --max-worker-restart=0
 
 test-all: test ## the same, and everything else that runs on 2 ranks (nightly)
 	$(BIN)/mpiexec -n 2 $(BIN)/python -m pytest -q

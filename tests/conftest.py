@@ -9,6 +9,7 @@ import gc
 import os
 import re
 import resource
+import signal
 import sys
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -25,6 +26,7 @@ for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL"):  # a test's own make must not 
 OWN = MPI.COMM_WORLD.Dup()  # never matches the messages of a test
 OUTCOMES = ("passed", "skipped", "failed")
 SERIAL = {"study", "benchmarks", "hardcases"}  # rooms above lqr
+MOST = 280  # [s] of a test, below faulthandler_timeout
 LINES = 15  # of a failure, when it happens; all of it comes at the end
 LIMIT = float(os.environ.get("MPI_TEST_LIMIT", "30"))  # [s] from one rank's failure to Abort
 
@@ -120,6 +122,24 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     """What the imports made stays: without it the collection after each test looks through it every time."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol() -> Generator[None, object, object]:
+    """End a test that waits for another process by an error that names it, before pytest ends the whole process."""
+    if OWN.size > 1:
+        return (yield)
+
+    def late(*_: object) -> None:
+        raise TimeoutError(f"still running after {MOST} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(MOST)
+    try:
+        return (yield)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
 
 
 @pytest.fixture(autouse=True)

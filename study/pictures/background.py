@@ -10,15 +10,18 @@ import signal
 import warnings
 from collections.abc import Callable
 from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import psutil
 from mpi4py import MPI
 
 from softgrasp.fem import note
 
 Draw = Callable[[Path], list[Path]]
+PATIENCE = 20.0  # [s] without any processor time, after which the other process is given up
 
 
 def draw_in_background(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[], list[Path]]:
@@ -26,7 +29,8 @@ def draw_in_background(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[
 
     What is drawn must be on this rank already: the process has all of it by fork, nothing is copied or packed, and only
     the names come back. Several ranks have the cores taken, and their network may not survive a fork: with them, on
-    one core and where no process can be started, the pictures are drawn when they are asked for.
+    one core and where no process can be started, the pictures are drawn when they are asked for. So are those of a
+    process that stands still: a fork copies a lock that a thread of the network has, and not the thread that frees it.
 
     Raises (when they are asked for):
         Exception: what ``draw`` raised.
@@ -49,9 +53,11 @@ def draw_in_background(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[
 
     def files() -> list[Path]:
         try:
-            done = receiver.recv()
+            done = receiver.recv() if _comes(receiver, process.pid) else OSError()
         except EOFError:  # killed, for want of memory
             done = OSError()
+        if isinstance(done, OSError):
+            process.kill()
         process.join()
         if isinstance(done, OSError):  # perhaps there is room in the folder itself
             return draw(out)
@@ -63,6 +69,17 @@ def draw_in_background(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[
             return [Path(shutil.move(file, out / file.name)) for file in done]
 
     return files
+
+
+def _comes(receiver: Connection, pid: int | None) -> bool:
+    """Wait for an answer while the process computes; False once it stands still."""
+    spent = -1.0
+    while not receiver.poll(PATIENCE):
+        now = sum(psutil.Process(pid).cpu_times()[:2])
+        if now - spent < 0.01:
+            return False
+        spent = now
+    return True
 
 
 def _send(sender: Any, draw: Draw, folder: Path) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
+import time
 from pathlib import Path
 
 import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.study.pictures import background
 from softgrasp.study.pictures.background import draw_in_background
 
 HERE = os.getpid()
@@ -47,3 +50,30 @@ def test_errors_come_back_and_a_lost_process_is_replaced(tmp_path: Path) -> None
 
     assert draw_in_background(COMM, tmp_path, killed)() == [tmp_path / "drawn.png"]
     assert (tmp_path / "drawn.png").read_text() == str(HERE)
+
+
+@pytest.mark.serial
+def test_a_process_that_stands_still_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lock that another thread had at the fork is never freed; one that computes is waited for."""
+    monkeypatch.setattr(background, "PATIENCE", 0.2)
+    lock = threading.Lock()
+
+    def waits(out: Path) -> list[Path]:
+        if os.getpid() != HERE:
+            lock.acquire()
+        return draw(out)
+
+    with lock:
+        files = draw_in_background(COMM, tmp_path, waits)
+        assert files() == [tmp_path / "drawn.png"]
+    assert (tmp_path / "drawn.png").read_text() == str(HERE)
+
+    def computes(out: Path) -> list[Path]:
+        while time.process_time() - began < 1.0:
+            pass
+        return draw(out)
+
+    began = time.process_time()
+    files = draw_in_background(COMM, tmp_path, computes)
+    assert files() == [tmp_path / "drawn.png"]
+    assert (tmp_path / "drawn.png").read_text() != str(HERE) or len(os.sched_getaffinity(0)) == 1
