@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from PIL import Image
 
 from softgrasp.fem import Array, PictureMesh, note
 from softgrasp.study.pictures import body
+from softgrasp.study.pictures.plate import around_bodies
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.pictures.style import TARGET, colour_map, fit, paper_style
 
@@ -23,6 +25,7 @@ MOST_FRAMES = 60
 TICKS = 2  # shortest time of a frame [1/100 s]; viewers slow down what is shorter
 MOST_BYTES = 3_000_000
 DPI = 110
+SMALL = 0.6  # share of the picture that a body in 3D fills at least; else the picture goes with it
 REST = 1.0  # [s] the last frame stays longer
 
 
@@ -54,7 +57,7 @@ def move_bytes(
     kept, durations = timing(times)
     frames, times = frames[kept].astype(np.float64), times[kept]
     shot = body.make_shot(picture, frames, times, table, target, None if tractions is None else tractions[kept])
-    return gif_bytes(_render(shot, frames, times), durations)
+    return gif_bytes(render(shot, frames, times), durations)
 
 
 def timing(times: Array) -> tuple[list[int], list[int]]:
@@ -70,26 +73,46 @@ def timing(times: Array) -> tuple[list[int], list[int]]:
     return kept, [*(10 * max(int(at[j] - at[i]), TICKS) for i, j in pairwise(kept)), int(1000 * REST)]
 
 
-def _render(shot: body.Shot, frames: Array, times: Array) -> list[Any]:
+def render(shot: body.Shot, frames: Array, times: Array) -> list[Any]:
     """One picture per frame, all of one size."""
+    frame = followed(shot, frames)
+    if frame:
+        shot = replace(shot, low=frame[0][0], high=frame[0][1])
     fast = speed_up(times)
     digits = int(np.clip(2 - np.floor(np.log10(times[-1] or 1.0)), 0, 6))
     note = f" ({fast:g}×)" if fast != 1 else ""
     with paper_style():
         figure, axes = body.make_axes(shot, 1, captions=False, width=5.4, tallest=4.2)
+
         # The longest text first, so that all frames have the size of the first.
-        stamp = axes[0].set_title(f"t = {times[-1]:.{digits}f} s{note}", pad=3)
+        def caption(k: int) -> str:
+            return f"t = {times[k]:.{digits}f} s{note}" + (body.place(shot.hands[k]) if frame else "")
+
+        stamp = axes[0].set_title(max(map(caption, range(len(times))), key=len), pad=3)
         body.colour_bar(figure, axes, shot)
         body.legend(figure, shot)
         body.settle(figure)
+        window = np.array([axes[0].get_xlim(), axes[0].get_ylim()]).T
 
         def draw(k: int) -> None:
+            if frame:
+                low, high = window + frame[k][0] - frame[0][0]
+                axes[0].set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
             body.draw_surroundings(axes[0], shot, [k])
             body.draw_scene(axes[0], shot, frames[k : k + 1], None, shot.hands[k : k + 1])
             body.name_layers(axes[0], shot, frames[k], inside=True)  # beside the body they would change sides
-            stamp.set_text(f"t = {times[k]:.{digits}f} s{note}")
+            stamp.set_text(caption(k))
 
         return film(figure, axes, draw, range(len(times)), [stamp])
+
+
+def followed(shot: body.Shot, frames: Array) -> list[tuple[Array, Array]]:
+    """Corners of a frame that goes with the body in 3D, where the whole way would make it small; else none."""
+    if shot.picture.dimension == 2:
+        return []
+    around = around_bodies(shot.picture, frames, shot.hands)
+    low, high = around[0]
+    return around if ((high - low) / (shot.high - shot.low)).max() < SMALL else []
 
 
 def film(

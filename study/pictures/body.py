@@ -107,7 +107,7 @@ def figure_move(
         groups = [[i] for i in range(len(states))] if apart else [list(range(len(states)))]
         figure, axes = make_axes(shot, len(groups), captions=True)
         for ax, group in zip(axes, groups if apart else (), strict=False):
-            ax.set_title(_time(times[group[0]]) + (_place(shot.hands[group[0]]) if solid else ""), pad=3)
+            ax.set_title(_time(times[group[0]]) + (place(shot.hands[group[0]]) if solid else ""), pad=3)
         colour_bar(figure, axes, shot)
         legend(figure, shot)
         settle(figure)
@@ -239,7 +239,7 @@ def _time(t: float) -> str:
     return f"t = {t:.3g} s"
 
 
-def _place(q: Array) -> str:
+def place(q: Array) -> str:
     """Where the hand is, under the time, in two digits."""
     x = q[:3]
     near = np.abs(x) < max(1e-3 * float(np.abs(x).max()), 1e-5)

@@ -8,6 +8,8 @@ from mpi4py import MPI
 
 from softgrasp.fem import PictureMesh, gather_picture
 from softgrasp.fem.model.build import build
+from softgrasp.study.pictures.animation import followed, render
+from softgrasp.study.pictures.body import make_shot
 from softgrasp.study.pictures.plate import PAD, THICK, around_bodies, hand_plate
 from softgrasp.study.pictures.shapes import seen
 from tests.helpers.models import CUBE, make_scene
@@ -41,3 +43,19 @@ def test_frames_hold_the_body_and_the_hand_and_have_one_size(cube: PictureMesh) 
     np.testing.assert_allclose(low_2 - low, seen(hands[1]), atol=1e-12)
     points = seen(np.vstack([cube.points, *hand_plate(cube, hands[0])[1]]))
     np.testing.assert_allclose(high - low, (1 + 2 * PAD) * np.ptp(points, axis=0))
+
+
+def test_a_film_goes_with_a_body_that_moves_far(cube: PictureMesh) -> None:
+    """Three sizes away each frame shows it as large as the frame around it, along the path; nearby nothing moves."""
+    times, u = np.linspace(0.0, 1.0, 5), np.zeros((5, *cube.points.shape))
+    coloured = []
+    for reach in (3.0, 0.2):
+        hands = times[:, None] * reach * np.ones(3)
+        states = u + hands[:, None, :] + 0.05 * np.linspace(0.0, 1.0, len(cube.points))[:, None]
+        shot = make_shot(cube, states, times, np.column_stack([times, hands]), None)
+        assert len(followed(shot, states)) == (5 if reach == 3.0 else 0)
+        images = [np.asarray(image, dtype=int) for image in render(shot, states, times)]
+        coloured.append([float((np.ptp(image, axis=2) > 60).mean()) for image in images])
+    far, near = coloured
+    assert min(far) > 0.15  # of the picture, the colour bar included
+    assert min(far) > min(near)

@@ -252,7 +252,7 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag not in ("meta", "img"):
+        if tag not in ("meta", "img", "input"):
             self.open.append(tag)
         addresses = [value or "" for key, value in attrs if key in ("src", "href")]
         self.sources += [a for a in addresses if not a.startswith("#")]  # the contents link within the page
