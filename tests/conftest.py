@@ -26,7 +26,7 @@ for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL"):  # a test's own make must not 
 OWN = MPI.COMM_WORLD.Dup()  # never matches the messages of a test
 OUTCOMES = ("passed", "skipped", "failed")
 SERIAL = {"study", "benchmarks", "hardcases"}  # rooms above lqr
-MOST = 280  # [s] of a test, below faulthandler_timeout
+MOST = 600  # [s] of a test, below faulthandler_timeout
 LINES = 15  # of a failure, when it happens; all of it comes at the end
 LIMIT = float(os.environ.get("MPI_TEST_LIMIT", "30"))  # [s] from one rank's failure to Abort
 
