@@ -20,10 +20,31 @@ class LayerMaterial:
     beta: float = 0.0  # Kelvin-Voigt time, D = beta K [s]
     part: str = ""  # name of the parameter whose value mu is, in a row of an own energy or term; empty in a layer
     fixed: tuple[tuple[str, float], ...] = ()  # parameters that the operators are not affine in, with their values
+    adds: str = ""  # what the row of an own term adds to: "stiffness", "damping", "mass" or "load"; else empty
 
     def __post_init__(self) -> None:
         pairs = tuple((str(key), float(value)) for key, value in self.fixed)  # lists, if they come from JSON
         object.__setattr__(self, "fixed", pairs)
+
+    @property
+    def stiff(self) -> float:
+        """Factor of K_mu in the stiffness [Pa]."""
+        return self.mu if self.adds in ("", "stiffness") else 0.0
+
+    @property
+    def viscous(self) -> float:
+        """Factor of K_mu in the damping matrix [Pa s]."""
+        return self.mu if self.adds == "damping" else self.beta * self.stiff
+
+    @property
+    def dense(self) -> float:
+        """Factor of M_1 in the mass [kg/m^3]."""
+        return self.mu if self.adds == "mass" else self.rho
+
+    @property
+    def pulls(self) -> float:
+        """Factor of the row's own load [N]."""
+        return self.mu if self.adds == "load" else 0.0
 
 
 def differs(new: Sequence[LayerMaterial], old: Sequence[LayerMaterial]) -> str:

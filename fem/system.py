@@ -43,6 +43,8 @@ class LayerBlocks:
     K_mu: Component  # stiffness at mu = 1, lambda = 0 [m^(d-2), in 2D times the thickness]
     K_lambda: Component  # stiffness at mu = 0, lambda = 1, in the same unit
     M_1: Component  # mass at rho = 1 [m^d, in 2D times the thickness]
+    load: tuple[Array, Array] | None = None  # own load at value 1: free rows (n_local,), and hand (n_s,) [N, N m]
+    definite: bool = True  # whether the form of an own term is positive semidefinite
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,32 @@ class BlockSystem(Shown):
         return np.zeros(self.layout.n_s) if self.gravity is None else self.gravity
 
     @property
+    def own_load(self) -> Array | None:
+        """Load of own terms on the free nodes, local rows (n_local,) [N]; None without such terms."""
+        rows = [(m.pulls, x.load[0]) for x, m in zip(self.layers, self.materials, strict=True) if x.load is not None]
+        return sum_dense(rows) if rows else None
+
+    @property
+    def own_wrench(self) -> Array:
+        """The same on hand and tissue as they move rigidly, (n_s,) [N, N m]."""
+        rows = [(m.pulls, x.load[1]) for x, m in zip(self.layers, self.materials, strict=True) if x.load is not None]
+        return sum_dense(rows) if rows else np.zeros(self.layout.n_s)
+
+    @property
+    def static_load(self) -> Array | None:
+        """Weight and own loads on the free nodes, G g + f, local rows (n_local,) [N]; None where there is neither."""
+        own, weight = self.own_load, None if self.gravity is None else self.G @ self.gravity
+        if own is None or weight is None:
+            return weight if own is None else own
+        return np.asarray(weight + own)
+
+    @property
+    def springs(self) -> PETSc.Mat | None:
+        """Stiffness of own terms, which finite strain adds to its law; None without such terms. Collective."""
+        rows = [(m.mu, x.K_mu.ee) for x, m in zip(self.layers, self.materials, strict=True) if m.adds == "stiffness"]
+        return combine(rows) if rows else None
+
+    @property
     def weight(self) -> Array:
         """Weight of the hand, zero unless gravity acts on it, (n_s,) [N, N m]."""
         return self.M_hand @ self.fall if self.hand_weight else np.zeros(self.layout.n_s)
@@ -111,7 +139,7 @@ class BlockSystem(Shown):
     @property
     def M_es(self) -> Array:
         """The paper's M_es, local rows (n_local, n_s)."""
-        return sum_dense([(m.rho, layer.M_1.es) for layer, m in zip(self.layers, self.materials, strict=True)])
+        return sum_dense([(m.dense, layer.M_1.es) for layer, m in zip(self.layers, self.materials, strict=True)])
 
     @property
     def K_es(self) -> Array:
@@ -154,7 +182,7 @@ def _stiffness(layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, 
     return [
         (factor, getattr(component, block))
         for layer, m in zip(layers, materials, strict=True)
-        for factor, component in ((m.mu, layer.K_mu), (m.lam, layer.K_lambda))
+        for factor, component in ((m.stiff, layer.K_mu), (m.lam, layer.K_lambda))
     ]
 
 
@@ -162,7 +190,7 @@ def tissue_matrices(
     layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...]
 ) -> tuple[PETSc.Mat, PETSc.Mat]:
     """M_ee = sum rho M_1 and K_ee = sum mu K_mu + lambda K_lambda over the layers. Collective."""
-    M = combine([(m.rho, layer.M_1.ee) for layer, m in zip(layers, materials, strict=True)])
+    M = combine([(m.dense, layer.M_1.ee) for layer, m in zip(layers, materials, strict=True)])
     K = combine(_stiffness(layers, materials, "ee"))
     for A in (M, K):
         A.setOption(PETSc.Mat.Option.SPD, True)
@@ -170,11 +198,12 @@ def tissue_matrices(
 
 
 def layered_viscosity(layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...]) -> PETSc.Mat | None:
-    """D_ee = sum beta_k K_k when the layers differ in beta; None when they share one beta. Collective."""
-    if len({m.beta for m in materials}) == 1:
+    """D_ee = sum beta_k K_k + own terms; None when the layers share one beta and no term adds damping. Collective."""
+    if len({m.beta for m in materials}) == 1 and all(m.adds != "damping" for m in materials):
         return None
-    viscous = tuple(replace(m, lam=m.beta * m.lam, mu=m.beta * m.mu) for m in materials)
-    return combine(_stiffness(layers, viscous, "ee"))
+    pairs = zip(layers, materials, strict=True)
+    terms = ((m.viscous, x.K_mu.ee, m.beta * m.lam, x.K_lambda.ee) for x, m in pairs)
+    return combine([term for a, K_mu, b, K_lambda in terms for term in ((a, K_mu), (b, K_lambda))])
 
 
 def dynamic_stiffness(system: BlockSystem, s: float) -> PETSc.Mat:
@@ -191,6 +220,6 @@ def coupling(layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ..
     for layer, material in zip(layers, materials, strict=True):
         part = layer.M_1.es + times_columns(layer.M_1.ee, T)
         comm = layer.M_1.ee.comm.tompi4py()
-        rigid += material.rho * (layer.M_1.ss + total(comm, T.T @ part + layer.M_1.es.T @ T))
-        G += material.rho * part
+        rigid += material.dense * (layer.M_1.ss + total(comm, T.T @ part + layer.M_1.es.T @ T))
+        G += material.dense * part
     return G, (rigid + rigid.T) / 2

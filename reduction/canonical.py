@@ -36,6 +36,7 @@ from softgrasp.reduction.operators import (
     Parts,
     Reconstruction,
     layer_products,
+    own_loads,
     relative_rows,
     symmetric,
 )
@@ -81,6 +82,7 @@ def canonical_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Reconstru
         parts |= {f"K_{key}": each for each in stiffness}
     if system.damping.alpha:
         parts["WM"] = total(comm, W.T @ times_columns(system.M_ee, L_q))
+    parts |= own_loads(system, W)
     return parts, Reconstruction(layout, L_q, Y, W_G if basis.frame == "absolute" else None)
 
 
@@ -152,8 +154,11 @@ def canonical_system(
             if p.two_way:
                 D = D + p.alpha * c * S_q.T @ (parts["GL"] + parts["M_rigid"] @ S_q)
         E = E - D
+    load = p.load(F) - p.own_load(parts, "own_tissue")
+    if p.two_way and "own_hand" in parts:
+        load = load - S_q.T @ p.own_load(parts, "own_hand")
     C = outputs.C_z + outputs.C_s @ S_q
     return EnergySystem(
-        E, A, B, C, p.load(F), S_q, S_v, outputs.names, name=name, C_s=outputs.C_s, H_tissue=energy, H=hamiltonian,
+        E, A, B, C, load, S_q, S_v, outputs.names, name=name, C_s=outputs.C_s, H_tissue=energy, H=hamiltonian,
         two_way=p.two_way, structured=p.conservative, scale=p.scale,
     )  # fmt: skip

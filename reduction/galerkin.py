@@ -22,6 +22,7 @@ from softgrasp.reduction.operators import (
     Parts,
     Reconstruction,
     layer_products,
+    own_loads,
     relative_rows,
     symmetric,
 )
@@ -61,7 +62,7 @@ def galerkin_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Reconstruc
         if system.damping.active:
             (parts[f"D_{key}"],) = layer_products(system, f"K_{key}", Z_v, W)
     parts["M"], parts["energy_M"] = layer_products(system, "M_1", Z_v, W, Z_v)
-    return parts, Reconstruction(system.layout, Z, Z_v)
+    return parts | own_loads(system, W), Reconstruction(system.layout, Z, Z_v)
 
 
 def galerkin_system(name: str, parts: Parts, p: Parameters, outputs: Outputs, second_order: bool) -> EnergySystem:
@@ -77,6 +78,9 @@ def galerkin_system(name: str, parts: Parts, p: Parameters, outputs: Outputs, se
         A -= p.viscosity(parts["D_mu"], parts["D_lambda"])
         A -= p.alpha * (M if p.in_space else p.density(parts["M"]))
     F = G + (S_v.T @ rigid if p.two_way else 0.0) + (S_v.T @ M_hand if p.hand_weight else 0.0)
+    own = p.own_load(parts, "own_tissue")
+    if p.two_way and "own_hand" in parts:
+        own = own + S_v.T @ p.own_load(parts, "own_hand")
     energy = symmetric(p.stiffness(parts["energy_mu"], parts["energy_lambda"]) + p.density(parts["energy_M"]))
     cross = Z_G @ S_v
     hand = M_hand + rigid if p.two_way else M_hand
@@ -85,7 +89,7 @@ def galerkin_system(name: str, parts: Parts, p: Parameters, outputs: Outputs, se
         A,
         S_v.T.copy(),
         outputs.C_z + outputs.C_s @ S_q,
-        p.load(F),
+        p.load(F) + own,
         S_q,
         S_v,
         outputs.names,

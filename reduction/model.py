@@ -141,7 +141,8 @@ class ReducedModel(Shown):
             raise ModelError("beta > 0 needs a model projected with effects.damping; name it in the scene")
         scale = 1.0
         if self.coordinates == "qp":
-            ratios = [m.rho / old.rho for m, old in zip(materials, self.materials, strict=True)]
+            pairs = [(m.dense, old.dense) for m, old in zip(materials, self.materials, strict=True)]
+            ratios = [new / old if old else np.inf for new, old in pairs if old or new]
             scale = ratios[0]
             # the common factor enters squared at most: more than rounding apart is another mass distribution
             if max(ratios) - min(ratios) > 1e-12 * scale:

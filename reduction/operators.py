@@ -49,6 +49,18 @@ def layer_products(system: BlockSystem, component: str, Y: Array, *tests: Array)
     return [np.stack(each) for each in zip(*products, strict=True)]
 
 
+def own_loads(system: BlockSystem, W: Array) -> Parts:
+    """Loads of own terms at value 1 on the tissue, W'f (rows, N), and on the hand, (rows, n_s). Collective."""
+    if all(row.load is None for row in system.layers):
+        return {}
+    nothing = np.zeros(len(W)), np.zeros(system.layout.n_s)
+    loads = [nothing if row.load is None else row.load for row in system.layers]
+    return {
+        "own_tissue": np.stack([total(system.layout.comm, W.T @ f) for f, _ in loads]),
+        "own_hand": np.stack([wrench for _, wrench in loads]),
+    }
+
+
 def symmetric(X: Array) -> Array:
     """(X + X') / 2, of every matrix of a stack."""
     return np.asarray((X + X.swapaxes(-1, -2)) / 2)
@@ -70,11 +82,15 @@ class Parameters:
     @property
     def conservative(self) -> bool:
         """Whether nothing damps."""
-        return not self.damped or (self.alpha == 0 and all(m.beta == 0 for m in self.materials))
+        return not self.damped or (self.alpha == 0 and all(m.beta == 0 and m.viscous == 0 for m in self.materials))
 
     def load(self, F: Array) -> Array:
         """F = F g, (N,), of the matrix F (N, n_s) that maps an acceleration of the hand."""
         return np.zeros(len(F)) if self.gravity is None else np.asarray(F @ self.gravity)
+
+    def own_load(self, parts: Parts, key: str) -> Array | float:
+        """Load of own terms from one column a row, (rows, ..); 0 where there are none."""
+        return self._sum([m.pulls for m in self.materials], parts[key]) if key in parts else 0.0
 
     def _sum(self, weights: list[float], stack: Array) -> Array:
         # one product of a vector with a reshaped stack: an order of magnitude faster than a loop for small matrices
@@ -82,14 +98,14 @@ class Parameters:
 
     def density(self, stack: Array) -> Array:
         """Sum of rho_k X_k."""
-        return self._sum([m.rho for m in self.materials], stack)
+        return self._sum([m.dense for m in self.materials], stack)
 
     def stiffness(self, mu: Array, lam: Array) -> Array:
         """Sum of mu_k X_k + lambda_k Y_k."""
-        return self._sum([m.mu for m in self.materials], mu) + self._sum([m.lam for m in self.materials], lam)
+        return self._sum([m.stiff for m in self.materials], mu) + self._sum([m.lam for m in self.materials], lam)
 
     def viscosity(self, mu: Array, lam: Array) -> Array:
         """Sum of beta_k (mu_k X_k + lambda_k Y_k)."""
-        return self._sum([m.beta * m.mu for m in self.materials], mu) + self._sum(
+        return self._sum([m.viscous for m in self.materials], mu) + self._sum(
             [m.beta * m.lam for m in self.materials], lam
         )

@@ -83,7 +83,7 @@ def build(
             deformation gradient, p has ``mu`` and ``lam`` of the material, the names of ``tissue.parameters``, the
             place ``x`` at rest and the dimension ``d``. Its tangent at rest is K; with ``effects.finite_strain`` it
             is the law.
-        terms: own terms of the stiffness, :class:`softgrasp.fem.model.terms.Term` each.
+        terms: own terms of stiffness, damping, mass and load, :class:`softgrasp.fem.model.terms.Term` each.
         steps: whether the time steps have to carry the tolerance too: those of the scene's own run.
 
     Raises:

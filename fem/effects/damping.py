@@ -13,10 +13,9 @@ from softgrasp.fem.system import Damping, LayerBlocks, layered_viscosity
 
 def operator(scene: Scene, layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...]) -> Damping:
     """D = alpha M + beta K, or with a matrix when the layers differ in beta. Collective."""
-    law = scene.effects.damping
+    law, matrix = scene.effects.damping, layered_viscosity(layers, materials)
     if law is None:
-        return Damping()
-    matrix = layered_viscosity(layers, materials)
+        return Damping(matrix=matrix)
     return Damping(law.alpha, 0.0 if matrix is not None else materials[0].beta, law.drag == "space", matrix)
 
 

@@ -254,7 +254,11 @@ class Model(Shown):
                 has = ", ".join(known) or "none"
                 raise SceneError(text or f"the model has no parameter '{key}' that it is affine in; it has {has}")
             rows = [replace(m, mu=float(value)) if m.part == key else m for m in rows]
-        return replace(self, system=self.system.with_materials(tuple(rows)), accuracy=None)
+        system = self.system.with_materials(tuple(rows))
+        if self.scene._terms:
+            terms = import_module("softgrasp.fem.model.terms")  # few scenes pay for it
+            terms.check_values(system.layers, system.materials, system.K_ee, system.M_ee)
+        return replace(self, system=system, accuracy=None)
 
 
 def checked_model(model: object) -> Model:
@@ -366,6 +370,8 @@ def build(
         if scene._terms:
             layers, materials = _with_terms(space, scene, blocks, T, layers, materials)
         M_ee, K_ee = tissue_matrices(layers, materials)
+        if scene._terms:
+            import_module("softgrasp.fem.model.terms").check_values(layers, materials, K_ee, M_ee)
         G, M_rigid = coupling(layers, materials, T)
         inventory.operators += ["M_ee", "K_ee", "T", "G"]
         damping = damping_operator(scene, layers, materials)

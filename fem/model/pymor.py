@@ -45,12 +45,15 @@ def second_order(model: Model) -> Any:
         M_1 = to_scipy(layer.M_1.ee)
         G, rigid = coupling((layer,), (LayerMaterial(0.0, 0.0, 1.0),), system.T)
         mass.append((("rho",), i, inertia(G, rigid if system.two_way else 0 * rigid, M_1)))
-        parts = (("mu", layer.K_mu), ("lambda", layer.K_lambda))
-        stiffness += [((key,), i, tissue(to_scipy(part.ee))) for key, part in parts]
+        parts = [
+            ((key,), i, tissue(to_scipy(part.ee))) for key, part in (("mu", layer.K_mu), ("lambda", layer.K_lambda))
+        ]
+        dashpot = system.materials[i].adds == "damping"
+        stiffness += [] if dashpot else parts
         if damping.active:
             drag = inertia(G, rigid if system.two_way else 0 * rigid, M_1) if damping.in_space else tissue(M_1)
             loss.append((("rho",), i, damping.alpha * drag))
-            loss += [(("beta", *names), layer_, A) for names, layer_, A in stiffness[-2:]]
+            loss += [(names if dashpot else ("beta", *names), i, A) for names, _, A in parts]
     C = np.zeros((sum(o.size for o in model.outputs), n_s + n))
     C[:, :n_s] = np.vstack([o.C_s for o in model.outputs])
     C[:, n_s:] = model.output_columns.T
@@ -73,6 +76,6 @@ def parameter_values(materials: tuple[LayerMaterial, ...]) -> dict[str, list[flo
     return {
         "mu": [m.mu for m in materials],
         "lambda": [m.lam for m in materials],
-        "rho": [m.rho for m in materials],
+        "rho": [m.dense for m in materials],
         "beta": [m.beta for m in materials],
     }

@@ -43,8 +43,10 @@ class FiniteStrainMidpoint(TissueMidpoint):
     """
 
     def _parts(self) -> tuple[PETSc.Mat, ...]:
-        inertia = combine([(self.s * self.s, self.system.M_ee)])
-        return (inertia, viscosity(self.system, self.s)) if self.system.damping.active else (inertia,)
+        parts, springs = [combine([(self.s * self.s, self.system.M_ee)])], self.system.springs
+        if self.system.damping.active:
+            parts.append(viscosity(self.system, self.s))
+        return (*parts, *([] if springs is None else [springs]))
 
     def _prepare(self) -> None:
         """Points, vectors and iteration. Collective."""
@@ -53,7 +55,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
         if self.comm.size > 1 and not self.operators.whole:
             self.dot = lambda a, b: self.over_ranks(float(np.dot(a, b)))
         self.body, self.tol = self._make_body()
-        self.inertia, self.drag = (*self.operators.parts, None)[:2]
+        self.inertia, *others = self.operators.parts
+        self.drag = others[0] if self.system.damping.active else None
         for part in self.operators.parts:
             part.convert("aij")
         self.trial, self.f, self.y, self.solved = (self.w.duplicate() for _ in range(4))
@@ -75,7 +78,10 @@ class FiniteStrainMidpoint(TissueMidpoint):
         assert points is not None
         if self.operators.whole:
             points = whole_points(points, self.comm, self.operators.enter(np.arange(system.layout.n_e)))
-        body = HyperelasticBody(points, system.materials, None if self.operators.whole else system.K_ee)
+        count = 2 if system.damping.active else 1
+        springs = self.operators.parts[count] if len(self.operators.parts) > count else None
+        pattern = None if self.operators.whole else system.K_ee
+        body = HyperelasticBody(points, system.materials, pattern, springs)
         if not self.comm.allreduce(body.kernel is not None, MPI.LAND):
             body.kernel = None  # ranks that store all rows compute the same bits
         return body, points.tol
@@ -184,7 +190,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
             SolverError: no convergence, not even by substepping; the message names the cell with the smallest J.
         """
         self.feedback, self.jump, counts = feedback, None, self.counts
-        self.load = self.G @ c
+        self.load = self._load(c)
         self.right = self.r_array + self.load
         counts.scale = max(counts.scale, math.sqrt(self.dot(self.right, self.right)))
         past = self.past
@@ -204,6 +210,10 @@ class FiniteStrainMidpoint(TissueMidpoint):
         counts.iterations_since_factor += max(root.iterations - counts.first, 0)
         counts.iterations, counts.steps = counts.iterations + root.iterations, counts.steps + 1
         counts.most = max(counts.most, root.iterations)
+
+    def _load(self, c: Array) -> Array:
+        """G c and the load of own terms on the rows here [N]."""
+        return np.asarray(self.G @ c if self.own is None else self.G @ c + self.own)
 
     def _find(self, guess: Array) -> Root:
         """The root, moved to w'R = 0 by a small fraction of an earlier correction. Collective."""
@@ -334,7 +344,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
     def _substeps(self, load: Array, begin: Begin) -> Root | None:
         """All substeps of a step, each with its own tangent; None where one does not converge. Collective."""
         at, r, v, self.dissipated = begin
-        self.r.array_w[:], self.c, self.load = r, load, self.G @ load
+        self.r.array_w[:], self.c, self.load = r, load, self._load(load)
         w, jump, count, self.at = np.zeros_like(r), np.zeros_like(r), 0, at.copy()
         try:
             for _ in range(self.substeps):
@@ -364,9 +374,9 @@ class FiniteStrainMidpoint(TissueMidpoint):
             new.v.array_w[:] = v
 
     def pull(self) -> Array:
-        """G'w with w = (z_1 - z_0) / 2, and with (v_0 + v_1) / 2s, over the rows here, (2 n_s,)."""
+        """G'w with w = (z_1 - z_0) / 2, and with (v_0 + v_1) / 2s behind it, over the rows here."""
         work = super().pull()
-        return np.concatenate([work, work if self.jump is None else self.G.T @ self.rate])
+        return np.concatenate([work, work[: self.G.shape[1]] if self.jump is None else self.G.T @ self.rate])
 
     def _carry_on(self, z: PETSc.Vec) -> None:
         if self.jump is None:

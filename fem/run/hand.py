@@ -33,7 +33,8 @@ class HandStep:
     def __init__(self, system: BlockSystem, midpoint: TissueMidpoint, responses: bool = False) -> None:
         self.system, self.midpoint, self.comm = system, midpoint, system.layout.comm
         self.dt, self.s = midpoint.dt, midpoint.s
-        self.g, self.weight, self.alpha = system.fall, system.weight, system.damping.drag
+        self.g, self.alpha = system.fall, system.damping.drag
+        self.weight = system.weight + (system.own_wrench if system.two_way else 0.0)
         self.kappa = 1 + self.alpha * self.dt / 2
         self.theta = self.s**2 + self.alpha * self.s
         self.inexact = midpoint if isinstance(midpoint, InexactMidpoint) else None

@@ -131,7 +131,8 @@ class InexactMidpoint(TissueMidpoint):
     def energy(self, state: TissueState) -> float:
         """Energy as of the exact step, and keep the largest elastic one. Collective."""
         energy = super().energy(state)
-        self.strain = max(self.strain, -self._held_z(state).dot(self.k) / 4)
+        z, own = self._held_z(state), 0.0 if self.own is None else self.own
+        self.strain = max(self.strain, self.over_ranks(float(np.dot(z.array_r, own - self.k.array_r / 2))) / 2)
         return energy
 
     def solve_error(self) -> float:

@@ -122,6 +122,8 @@ class TissueMidpoint:
         # views stay valid for the life of a vector; a call of PETSc for them needs the time of a short dot product
         self.w_array, self.r_array, self.k_array = self.w.array_w, self.r.array_r, self.k.array_r
         self._couple()
+        own = system.own_load
+        self.own: Array | None = None if own is None else np.asarray(self.operators.gather(own))
         self.x, self._move = self.w, self._held_z
         if self.operators.whole:
             self.x, self.z = system.K_ee.createVecRight(), self.w.duplicate()
@@ -141,7 +143,7 @@ class TissueMidpoint:
         self.alpha, self.beta = damping.alpha, damping.beta
         self.a = 2 * self.s / (self.s + self.alpha)
         self.b = self.a * (1 + self.s * self.beta) / 2
-        self._propagate = self._undamped
+        self._propagate = self._undamped if self.own is None else self._undamped_loaded
         if damping.matrix is not None:
             self._prepare_general()
         elif damping.active:
@@ -202,7 +204,13 @@ class TissueMidpoint:
 
     def adopt(self, state: TissueState) -> None:
         """Continue from a state whose r is set. Collective."""
-        self.K2.mult(self._gathered_z(state), self.k)
+        self._pull_back(self._gathered_z(state))
+
+    def _pull_back(self, z: PETSc.Vec) -> None:
+        """Set k = -2 (K z - f), f the load of own terms. Collective."""
+        self.K2.mult(z, self.k)
+        if self.own is not None:
+            self.k.array_w[:] += 2 * self.own
 
     def _gathered_z(self, state: TissueState) -> PETSc.Vec:
         """The rows here of a new state. Collective."""
@@ -268,13 +276,19 @@ class TissueMidpoint:
         self.pending = self.c
 
     def pull(self) -> Array:
-        """G'w over the rows here, (n_s,), valid until the next call; the load G c of the step does the work 2 c'G'w."""
+        """G'w over the rows here, (n_s,), valid until the next call; the load G c of the step does the work 2 c'G'w.
+
+        Own loads f have f'w behind it, (n_s + 1,).
+        """
         self.coupling.multTranspose(self.w_here, self.moved)
+        if self.own is not None:
+            return np.append(self.moved_array, np.dot(self.own, self.w_array))
         return self.moved_array
 
     def work(self, loads: Array, pulls: Array) -> float:
         """Work of the loads in all of these steps, over the rows here [J]; arguments as for :meth:`works`."""
-        return 2 * float(np.einsum("ij,ij", loads, pulls[:, : loads.shape[1]]))
+        own = 0.0 if self.own is None else float(pulls[:, loads.shape[1]].sum())
+        return 2 * (float(np.einsum("ij,ij", loads, pulls[:, : loads.shape[1]])) + own)
 
     def works(self, loads: Array, pulls: Array) -> Array:
         """Work 2 c'G'w of the load in each step, over the rows here, (steps,) [J].
@@ -283,7 +297,8 @@ class TissueMidpoint:
             loads: coefficients c of each step, (steps, n_s).
             pulls: what :meth:`pull` returned after it, (steps, ..).
         """
-        return np.asarray(2 * (loads * pulls[:, : loads.shape[1]]).sum(axis=1))
+        own = 0.0 if self.own is None else pulls[:, loads.shape[1]]
+        return np.asarray(2 * ((loads * pulls[:, : loads.shape[1]]).sum(axis=1) + own))
 
     def _move_whole(self, state: TissueState) -> PETSc.Vec:
         """The rows here of a new z, by the operations that gave the state its rows: the same bits."""
@@ -293,10 +308,14 @@ class TissueMidpoint:
     def _undamped(self, z: PETSc.Vec) -> None:
         self.K2.multAdd(z, self.r, self.r)
 
+    def _undamped_loaded(self, z: PETSc.Vec) -> None:
+        self._pull_back(z)
+        self.r.axpy(1.0, self.k)
+
     def _proportional(self, z: PETSc.Vec) -> None:
         self.k, self.k_old = self.k_old, self.k
         self.k_array, self.k_old_array = self.k_old_array, self.k_array
-        self.K2.mult(z, self.k)
+        self._pull_back(z)
         w = self.w_array
         wKw = (np.dot(w, self.k_old_array) - np.dot(w, self.k_array)) / 4
         wMw = (np.dot(w, self.r_array) - (1 + self.s * self.beta) * wKw) / (self.s * (self.s + self.alpha))
@@ -308,18 +327,19 @@ class TissueMidpoint:
         self.M.mult(self.w, self.y)
         self.r.axpby(2 * self.s**2, -1.0, self.y)
         self.r.axpy(0.5, self.k)
-        self.K2.mult(z, self.k)
+        self._pull_back(z)
         self.r.axpy(0.5, self.k)
         self.D.mult(self.w, self.y)
         self.dissipated += 2 * self.s * float(np.dot(self.w_array, self.y_array))
 
     def energy(self, state: TissueState) -> float:
         """Energy (z' K z + v' M v) / 2 [J] of the state just reached, from the carried momentum. Collective."""
-        self.K2.mult(self._held_z(state), self.k)
+        self._pull_back(self._held_z(state))
         n, k = len(self.x_array), self.k_array[self.rows] / -2
         z, v = state.array[:n], state.array[n:]
         h = self.r_array[self.rows] + self.G[self.rows] @ self.pending
         momentum = (h + k) / self.s
+        k = k if self.own is None else k + self.own[self.rows]
         local = np.array([np.dot(z, k), np.dot(v, momentum)])
         return float(total(self.system.layout.comm, local).sum()) / 2
 
@@ -333,7 +353,7 @@ class TissueMidpoint:
         In equilibrium under gravity the load cancels in r, and a two-way step subtracts the hand's part from w: what is
         left is small against the load, not against the rounding in r.
         """
-        load = self.G[self.rows] @ self.c
+        load = self.G[self.rows] @ self.c + (0.0 if self.own is None else self.own[self.rows])
         square = total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]
         with self.operators.raise_on_all_ranks():
             return self.solver.check(self.r, self.w, "the midpoint", float(np.sqrt(square)))

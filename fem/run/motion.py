@@ -241,7 +241,8 @@ def force_taken(system: BlockSystem, pulls: Array, v: Array, c: Array, dt: float
     s = 2 / dt
     turn = np.where(np.arange(len(pulls) + 1) % 2 == 0, 1.0, -1.0)[:, None]
     rates, n_s = np.zeros_like(v), v.shape[1]
-    work, speed = pulls[:, :n_s], pulls[:, -n_s:]
+    work, speed = pulls[:, :n_s], pulls[:, -n_s:] if pulls.shape[1] >= 2 * n_s else pulls[:, :n_s]
     rates[1:] = -turn[1:] * np.cumsum(turn[:-1] * (2 * s * speed + kicks), axis=0)
     tissue = s * (s * speed - rates[:-1]) + system.damping.drag * s * work + kicks / dt
-    return np.asarray(np.diff(v, axis=0) / dt @ system.M_hand.T - c @ system.M_rigid.T + tissue - system.weight)
+    known = system.weight + system.own_wrench
+    return np.asarray(np.diff(v, axis=0) / dt @ system.M_hand.T - c @ system.M_rigid.T + tissue - known)

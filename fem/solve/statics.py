@@ -36,11 +36,12 @@ def equilibrium(
     Raises:
         SolverError: the stiffness is singular or the residual too large, or the loads of finite strain do not converge.
     """
-    if system.gravity is None:
+    held = system.static_load
+    if held is None:
         return np.zeros(system.layout.n_local)
     if system.points is not None:
         return finite_equilibrium(system, solver)
-    load = (system.G @ system.gravity)[:, None]
+    load = held[:, None]
     bits = "auto" if time is None else time.reproducible
     with factored_stiffness(system, solver, reproducible=bits) as factor, _watched(factor, notify):
         return factor.columns(load, "the static equilibrium")[:, 0]
@@ -121,12 +122,13 @@ def finite_equilibrium(system: BlockSystem, solver: SolverName | None = None) ->
     from softgrasp.fem.strain.body import HyperelasticBody  # only scenes with finite strain pay for it
 
     assert system.points is not None
-    assert system.gravity is not None
-    body, comm = HyperelasticBody(system.points, system.materials), system.layout.comm
+    held = system.static_load
+    assert held is not None
+    body, comm = HyperelasticBody(system.points, system.materials, springs=system.springs), system.layout.comm
     name = solver or choose_solver(system.layout, few=True)[0]
     z, f = system.K_ee.createVecs()
     load = z.duplicate()
-    load.array_w[:] = system.G @ system.gravity
+    load.array_w[:] = held
     t, step, answer = 0.0, 1.0, np.array(z.array_r)
     while t < 1.0:
         aim = min(t + step, 1.0)

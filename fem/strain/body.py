@@ -78,13 +78,18 @@ class HyperelasticBody:
         materials: material of each layer.
         pattern: matrix with the pattern of the tangents; None: that of B'AB, which on some ranks has fewer columns of
             other ranks than K_ee.
+        springs: further stiffness of own terms, whose force is linear; None for none.
 
     Attributes:
         rounding: norm over all rows of the force that rounding in the stress mu F leaves [N].
     """
 
     def __init__(
-        self, points: QuadraturePoints, materials: tuple[LayerMaterial, ...], pattern: PETSc.Mat | None = None
+        self,
+        points: QuadraturePoints,
+        materials: tuple[LayerMaterial, ...],
+        pattern: PETSc.Mat | None = None,
+        springs: PETSc.Mat | None = None,
     ) -> None:
         self.points, self.law = points, points.laws
         self.moduli = points.moduli(materials)
@@ -93,6 +98,9 @@ class HyperelasticBody:
         self.h = points.B.createVecLeft()
         self.H: Array = self.h.array_w.reshape(self.shape)  # overwritten by every product
         self.pattern = pattern if points.B.comm.size > 1 else None
+        self.springs = springs
+        if springs is not None:
+            self.pull, self.held = springs.createVecLeft(), springs.createVecLeft()
         self.A: PETSc.Mat | None = None
         self.product: PETSc.Mat | None = None
         self.K: PETSc.Mat | None = None
@@ -123,11 +131,20 @@ class HyperelasticBody:
 
     def energy(self, z: PETSc.Vec) -> float:
         """This rank's share of W(z) [J]. Collective."""
-        return float(self.points.vol @ self.law.energy(self.gradient(z), *self.moduli))
+        energy = float(self.points.vol @ self.law.energy(self.gradient(z), *self.moduli))
+        return energy + float(np.dot(z.array_r, self._sprung(z))) / 2 if self.springs is not None else energy
+
+    def _sprung(self, z: PETSc.Vec) -> Array:
+        """Force of the springs on the rows here [N]; valid until the next call. Collective."""
+        assert self.springs is not None
+        self.springs.mult(z, self.pull)
+        return np.asarray(self.pull.array_r)
 
     def force(self, z: PETSc.Vec, f: PETSc.Vec) -> None:
         """Force f = B' (vol P(B z)) [N]. Collective."""
         self._collect(self.law.stress(self.gradient(z), *self.moduli), f)
+        if self.springs is not None:
+            f.array_w[:] += self._sprung(z)
 
     def sound(self, z: PETSc.Vec) -> bool:
         """Whether the law has a tangent at z in the points of this rank. Collective."""
@@ -135,6 +152,8 @@ class HyperelasticBody:
 
     def start(self, z: PETSc.Vec) -> Start:
         """The law at the start of a step; valid until the next call. Collective."""
+        if self.springs is not None:
+            self.springs.mult(z, self.held)
         return self.law.start(self.gradient(z)) if self.kernel is None else self.kernel.start(z.array_r)
 
     def step(self, start: Start, w: PETSc.Vec, f: PETSc.Vec) -> bool:
@@ -144,10 +163,14 @@ class HyperelasticBody:
         """
         if self.kernel is not None:
             self.J = self.kernel.J
-            return bool(self.kernel.force(w.array_r, f.array_w))
-        P, self.J = self.law.step(start, self.gradient(w), *self.moduli)
-        self._collect(P if P is not None else self.H, f)  # all ranks take part in the product
-        return P is not None
+            fine = bool(self.kernel.force(w.array_r, f.array_w))
+        else:
+            P, self.J = self.law.step(start, self.gradient(w), *self.moduli)
+            self._collect(P if P is not None else self.H, f)  # all ranks take part in the product
+            fine = P is not None
+        if self.springs is not None:  # of z + w, the mean of both ends
+            f.array_w[:] += self.held.array_r + self._sprung(w)
+        return fine
 
     def refuse(self, start: Start, comm: MPI.Intracomm | None) -> None:
         """Refuse a state that the law does not describe: an inverted cell, or one pressed too far. Collective.
@@ -210,11 +233,14 @@ class HyperelasticBody:
             self.A.setValuesCSR(self.indptr, self.columns, values)
             self.A.assemble()
             self.A.ptap(self.points.B, self.product)
-        if self.K is None:
-            return self.product
-        self.K.zeroEntries()
-        self.K.axpy(1.0, self.product, PETSc.Mat.Structure.SUBSET)
-        return self.K
+        result = self.product
+        if self.K is not None:
+            self.K.zeroEntries()
+            self.K.axpy(1.0, self.product, PETSc.Mat.Structure.SUBSET)
+            result = self.K
+        if self.springs is not None:
+            result.axpy(1.0, self.springs, PETSc.Mat.Structure.SUBSET)
+        return result
 
     def destroy(self) -> None:
         """Free PETSc's objects; the points are not the body's own. Collective."""

@@ -23,9 +23,12 @@ def linearised(model: Model) -> Model:
     system = model.system
     if system.points is None:
         return model
-    if system.gravity is None:
+    if system.static_load is None:
         return replace(model, system=replace(system, points=None))
-    body, z = HyperelasticBody(system.points, system.materials, system.K_ee), system.K_ee.createVecRight()
+    body, z = (
+        HyperelasticBody(system.points, system.materials, system.K_ee, system.springs),
+        system.K_ee.createVecRight(),
+    )
     z.array_w[:] = equilibrium(system)
     K = body.tangent(z).copy()
     K.setOption(PETSc.Mat.Option.SPD, True)

@@ -115,8 +115,9 @@ def responses(
     Raises SolverError: a solve failed.
     """
     n_s, n = problem.layout.n_s, problem.layout.n_local
-    # differences of two states feel no gravity
-    problem = replace(problem, system=replace(problem.system, gravity=None, hand_weight=False))
+    # differences of two states feel no gravity and no own loads
+    layers = tuple(replace(layer, load=None) for layer in problem.system.layers)
+    problem = replace(problem, system=replace(problem.system, layers=layers, gravity=None, hand_weight=False))
     rest = PlantState(np.zeros(n_s), np.zeros(n_s), np.zeros(n), np.zeros(n))
     begin = PlantState(*(part[:, 0] for part in start.parts))
     inputs = np.zeros((n_s + 1, steps, n_s))

@@ -57,8 +57,8 @@ def galerkin(problem: RiccatiProblem, V: Array) -> tuple[ReducedSystem, Shapes]:
         raise ControlError(f"the {k} shapes of the tissue are linearly dependent; orthonormalise them first")
     space = assemble_space(problem, TissueMatrices(M, K, D, G, C_z))
     f = np.zeros(len(space.E))
-    if system.gravity is not None:
-        f[2 * n_s + k :] = G @ system.gravity
+    if (load := system.static_load) is not None:
+        f[2 * n_s + k :] = total(comm, V.T @ load)
     f[n_s : 2 * n_s] = -steady_input(system)
     S = np.eye(2 * n_s, len(f))
     plant = ReducedSystem(space.E, space.A, space.B, space.C, f, S[:n_s], S[n_s:], labels(problem.columns))

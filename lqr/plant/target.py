@@ -34,12 +34,10 @@ class Target(Shown):
 def steady_input(system: BlockSystem) -> Array:
     """u_bar that balances the weight of the hand (and, two-way, of the tissue) [N, N m], (n_s,)."""
     u = np.zeros(system.layout.n_s)
-    if system.gravity is None:
-        return u
     if system.hand_weight:
-        u -= system.M_hand @ system.gravity
+        u -= system.M_hand @ system.fall
     if system.two_way:
-        u -= system.M_rigid @ system.gravity
+        u -= system.M_rigid @ system.fall + system.own_wrench
     return u
 
 

@@ -234,7 +234,7 @@ def weight_blocks(problem: RiccatiProblem) -> tuple[Array, Array]:
     system = problem.system
     if not system.two_way:
         return system.M_hand, system.M_es / 2
-    tissue = sum(m.rho * layer.M_1.ss for layer, m in zip(system.layers, system.materials, strict=True))
+    tissue = sum(m.dense * layer.M_1.ss for layer, m in zip(system.layers, system.materials, strict=True))
     return np.asarray(system.M_hand + tissue), system.M_es
 
 

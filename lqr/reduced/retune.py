@@ -46,7 +46,7 @@ class Retuner:
     def _stiffness(self, materials: Materials) -> Array:
         result = np.zeros_like(self.matrices.A)
         for (mu, lam), m in zip(self.parts, materials, strict=True):
-            result += m.mu * (mu[0] + m.beta * mu[1]) + m.lam * (lam[0] + m.beta * lam[1])
+            result += m.stiff * mu[0] + m.viscous * mu[1] + m.lam * (lam[0] + m.beta * lam[1])
         return result
 
     def at(self, materials: Materials) -> WeightedSystem:
@@ -57,7 +57,7 @@ class Retuner:
         if len(materials) != len(self.reference):
             raise ControlError(f"{len(materials)} materials are given; the body has {len(self.reference)} layers")
         for old, new in zip(self.reference, materials, strict=True):
-            if new.rho != old.rho:
+            if new.dense != old.dense:
                 raise ControlError(f"rho = {new.rho:g} differs from {old.rho:g}; re-tuning covers lambda, mu and beta")
         return replace(self.matrices, A=self.A_0 + self._stiffness(materials))
 

@@ -1,4 +1,4 @@
-"""Own terms of the stiffness: against matrices assembled by hand, with reduced models, restarts' hash and refusals."""
+"""Own terms: against matrices assembled by hand, against effects that they repeat, and refusals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,13 @@ import ufl
 from mpi4py import MPI
 
 import softgrasp as sg
+from softgrasp.fem.errors import Paused
 from softgrasp.fem.petsc import times_columns, total
+from softgrasp.fem.run.simulate import RunOptions
+from softgrasp.fem.solve.statics import equilibrium
+from softgrasp.fem.strain.body import HyperelasticBody
+from softgrasp.lqr.plant.target import hand_target
+from softgrasp.reduction.online import run as march
 
 KEYS = ["tissue.cells=[4, 8]", "time.steps=40", "time.end=4.0"]
 
@@ -66,7 +72,7 @@ REFUSED = {
     "no such tag": (lambda u, v: ufl.inner(u, v) * ufl.ds(99), 1.0, {}, "adds nothing to the stiffness"),
     "fails": (lambda u, v: u[7] * v[7] * ufl.dx, 1.0, {}, "ended with"),
     "value": (on_boundary, float("nan"), {}, "give a finite number"),
-    "finite strain": (on_boundary, 1.0, {"effects": {"finite_strain": {}}}, "cannot go with effects.finite_strain"),
+    "negative": (on_boundary, -1e4, {}, "not positive definite, so that some motion of the tissue has no force"),
 }
 
 
@@ -107,3 +113,212 @@ def test_keys_beside_a_loaded_scene_are_refused_with_terms_too():
     scene = sg.build("paper_forward", ["tissue.cells=[2, 4]"]).scene
     with pytest.raises(sg.fem.SceneError, match="need the file or the name of a scene"):
         sg.build(scene, ["tissue.cells=[3, 4]"], terms=[sg.Term("bed", on_boundary, 1.0)])
+
+
+def whole_body(u, v):
+    """Of all the body, for masses and dashpots."""
+    return ufl.inner(u, v) * ufl.dx
+
+
+def runs(keys, terms, other, **tables):
+    """A run with terms, and one with keys that do the same."""
+    own = sg.simulate(sg.build("paper_lqr", [*KEYS, *keys], terms=terms, **tables))
+    same = sg.simulate(sg.build("paper_lqr", [*KEYS, *keys, *other], **tables))
+    return own, same
+
+
+def assert_same(own, same, digits=1e-10):
+    for key in ("outputs", "q_s", "force", "energy", "dissipated"):
+        one, two = getattr(own, key), getattr(same, key)
+        assert np.abs(one - two).max() <= digits * max(np.abs(two).max(), 1e-300), key
+    assert own.energy_drift < 1e-10
+
+
+TWO_WAY = ["effects.reaction=true", "motion.drive='force'"]
+BODY = {"effects": {"rotation": True, "frame": "hand"}, "hand": {"inertia": 1.0}, "motion": {"target": [1.0, 0.5, 0.1]}}
+EFFECTS = {
+    "one-way": [],
+    "two-way": TWO_WAY,
+    "undamped": ["effects.damping=false"],
+    "finite strain": ["effects.finite_strain={}", "motion.target=[1.0, 0.5]"],
+    "finite strain, two-way": ["effects.finite_strain={}", *TWO_WAY],
+    "cg": ["time.solver='cg'", "time.rtol=1e-13"],
+}
+
+
+def on_ranks(*cases, alone=()):
+    """Cases that run on ranks too, and those that run on one alone."""
+    return [*(pytest.param(case, marks=pytest.mark.ranks) for case in cases), *alone]
+
+
+@pytest.mark.parametrize("case", on_ranks("two-way", alone=["one-way", "finite strain"]))
+def test_an_own_mass_of_all_the_body_is_more_density(case):
+    weight = ["effects.gravity={g=[0.0, -0.3]}", *EFFECTS[case]]
+    extra = sg.Term("ballast", whole_body, 0.7, adds="mass")
+    assert_same(*runs(weight, [extra], ["tissue.material.rho=1.7"]), 1e-8 if "finite" in case else 1e-10)
+
+
+@pytest.mark.parametrize("case", on_ranks("finite strain", alone=["one-way", "two-way"]))
+def test_dashpots_in_all_the_body_are_rayleigh_damping(case):
+    air = sg.Term("air", whole_body, 0.4, adds="damping")
+    keys = [*EFFECTS[case], "effects.damping=false"]
+    own, same = runs(keys, [air], ["effects.damping={kind='rayleigh',alpha=0.4,beta=0,drag='hand'}"])
+    assert_same(own, same, 1e-8 if "finite" in case else 1e-10)  # the tolerance of a step at finite strain is 1e-9
+    assert own.dissipated[-1] > 0
+
+
+@pytest.mark.parametrize("start", on_ranks("equilibrium", alone=["rest"]))
+@pytest.mark.parametrize("case", list(EFFECTS))
+def test_an_own_load_of_all_the_body_is_its_weight(case, start):
+    """Equilibrium, reaction, work and damping of a load are those of gravity, whose code is another."""
+    keys = [*EFFECTS[case], "effects.gravity={g=[0.0, 0.0]}", f"time.start='{start}'"]
+    pull = sg.Term("pull", lambda v: (0.3 * v[0] - v[1]) * ufl.dx, 0.2, adds="load")
+    own, same = runs(keys, [pull], ["effects.gravity={g=[0.06, -0.2]}"])
+    assert_same(own, same, 1e-7 if "finite" in case else 1e-9)  # steps to 1e-9, solves to 1e-13 of larger loads
+    half = sg.build("paper_lqr", [*KEYS, *keys], terms=[sg.Term("pull", pull.form, 0.1, adds="load")])
+    if case == "one-way":
+        assert_same(sg.simulate(half.with_parameters(pull=0.2)), same, 1e-9)
+
+
+@pytest.mark.ranks
+def test_a_pressure_has_the_resultant_and_moment_of_statics():
+    """On the free lower side of a body in 2D, 1 m wide: p times its length, at the middle."""
+    n = ufl.FacetNormal
+    pressure = sg.Term(
+        "pressure", lambda v: -ufl.dot(n(ufl.domain.extract_unique_domain(v)), v) * low(v) * ufl.ds, 3.0, adds="load"
+    )
+    keys = [
+        "tissue.cells=[4, 8]",
+        "effects.rotation=true",
+        "hand.inertia=1.0",
+        "hand.reference=[0.2, 0.0]",
+        "motion.target=[1.0, 0.0, 0.0]",
+    ]
+    system = sg.build("paper_forward", keys, terms=[pressure], tissue={"thickness": 0.5}).system
+    assert np.abs(system.own_wrench - 1.5 * np.array([0.0, 1.0, 0.3])).max() < 1e-13  # sums of a few numbers
+
+
+def low(v):
+    x = ufl.SpatialCoordinate(ufl.domain.extract_unique_domain(v))
+    return ufl.conditional(x[1] < 1e-9, 1.0, 0.0)
+
+
+@pytest.mark.ranks
+def test_springs_at_finite_strain_keep_the_energy_and_carry_the_weight():
+    bed = sg.Term("bed", on_boundary, 30.0)
+    keys = [*KEYS, "effects.finite_strain={tol=1e-11}", "effects.damping=false", "effects.gravity={g=[0.0, -3.0]}"]
+    model = sg.build("paper_lqr", [*keys, "motion.target=[1.0, 0.5]", "time.start='equilibrium'"], terms=[bed])
+    system, comm = model.system, model.system.layout.comm
+    run = sg.simulate(model)
+    assert run.energy_drift < 1e-11
+    body = HyperelasticBody(system.points, system.materials, system.K_ee)
+    z, f = system.K_ee.createVecs()
+    z.array_w[:] = equilibrium(system)
+    body.force(z, f)  # of the law alone
+    V = model.space.V
+    A = dolfinx.fem.petsc.assemble_matrix(dolfinx.fem.form(on_boundary(ufl.TrialFunction(V), ufl.TestFunction(V))))
+    A.assemble()
+    own = A.createSubMatrix(model.space.is_e, model.space.is_e)
+    left = f.array_r + 30.0 * times_columns(own, z.array_r[:, None])[:, 0] - system.G @ system.gravity
+    norms = total(comm, np.array([left @ left, f.array_r @ f.array_r]))
+    assert norms[0] < (1e-9) ** 2 * norms[1]  # the equilibrium is solved to 1e-11
+    soft = [*KEYS, "motion.target=[1e-4, 5e-5]", "effects.damping=false"]  # strains below 1e-4
+    finite = sg.simulate(sg.build("paper_lqr", [*soft, "effects.finite_strain={}"], terms=[bed]))
+    linear = sg.simulate(sg.build("paper_lqr", soft, terms=[bed]))
+    bend = linear.outputs - linear.outputs_rigid
+    assert np.abs(finite.outputs - linear.outputs).max() < 1e-3 * np.abs(bend).max()
+
+
+@pytest.mark.parametrize("method", on_ranks("psd", alone=["craig_bampton", "psd_fixed", "pod_fixed"]))
+@pytest.mark.parametrize("keys", [[], TWO_WAY], ids=["one-way", "two-way"])
+def test_reduced_models_have_own_mass_damping_and_load_as_the_same_effects(method, keys):
+    keys = [*KEYS, *keys, "effects.gravity={g=[0.0, 0.0]}", "effects.damping={kind='rayleigh',alpha=0.1,beta=0.002}"]
+    terms = [
+        sg.Term("ballast", whole_body, 0.7, adds="mass"),
+        sg.Term("air", whole_body, 0.4, adds="damping"),
+        sg.Term("pull", lambda v: (0.3 * v[0] - v[1]) * ufl.dx, 0.34, adds="load"),
+    ]
+    alpha = 0.1 + 0.4 / 1.7
+    other = [
+        "tissue.material.rho=1.7", "effects.gravity={g=[0.06, -0.2]}",
+        f"effects.damping={{kind='rayleigh',alpha={alpha!r},beta=0.002}}",
+    ]  # fmt: skip
+    own, same = sg.build("paper_lqr", keys, terms=terms), sg.build("paper_lqr", [*keys, *other])
+    small = []
+    for model in (own, same):
+        rom = sg.reduce(model, sg.simulate(model), method, N=12)
+        u = np.sin(np.outer(np.arange(200), [0.02, 0.03]))
+        small.append(march(rom.at(), 0.01, u, allow_unstable=True))
+    bend = np.abs(small[1].outputs).max()
+    assert np.abs(small[0].outputs - small[1].outputs).max() < 1e-6 * bend  # bases of snapshots equal to 1e-10
+
+
+@pytest.mark.ranks
+def test_feedback_meets_an_own_load_at_its_equilibrium():
+    keys = ["tissue.cells=[4, 8]", *TWO_WAY, "effects.gravity={g=[0.0, 0.0]}", "time.start='equilibrium'"]
+    pull = sg.Term("pull", lambda v: (0.3 * v[0] - v[1]) * ufl.dx, 0.2, adds="load")
+    own, same = (
+        sg.build("paper_lqr", keys, terms=[pull]),
+        sg.build("paper_lqr", [*keys, "effects.gravity={g=[0.06, -0.2]}"]),
+    )
+    targets = [hand_target(sg.problem(model), np.array([1.0, 0.5])) for model in (own, same)]
+    for one, two in zip(*((t.state.z, t.u, t.y) for t in targets), strict=True):
+        assert np.abs(one - two).max(initial=0.0) < 1e-10
+
+
+@pytest.mark.ranks
+def test_a_stopped_run_with_an_own_load_goes_on_bit_by_bit(mpi_tmp_path):
+    pull = sg.Term("pull", lambda v: v[0] * ufl.dx, 0.2, adds="load")
+
+    def run(**how):
+        model = sg.build("paper_lqr", KEYS, terms=[pull])
+        return sg.simulate(model, RunOptions(directory=mpi_tmp_path, **how))
+
+    whole = run()
+    with pytest.raises(Paused):
+        run(until=15)
+    rest = run(resume=True)
+    assert np.array_equal(rest.outputs, whole.outputs)
+    assert rest.energy_drift == whole.energy_drift < 1e-11
+
+
+REFUSED_VALUES = {
+    "mass": (sg.Term("hole", whole_body, -2.0, adds="mass"), {}, "hole = -2: with that the mass matrix M_ee is not"),
+    "damping": (sg.Term("motor", whole_body, -1.0, adds="damping"), {}, "would feed energy into some motion"),
+    "indefinite": (sg.Term("mixed", lambda u, v: u[0] * v[0] * ufl.dx - u[1] * v[1] * ufl.dx, 1.0, adds="damping"),
+                   {}, "its form would feed energy"),
+    "two arguments": (sg.Term("p", lambda u, v: v[0] * ufl.dx, 1.0, adds="load"), {}, "ended with TypeError"),
+    "bilinear": (sg.Term("p", lambda v: ufl.inner(v, v) * ufl.dx, 1.0, adds="load"), {}, "ended with|must be a linear"),
+    "kind": (sg.Term("p", whole_body, 1.0, adds="glue"), {}, "choose stiffness, damping, mass, load"),
+    "frame": (sg.Term("p", lambda v: v[0] * ufl.dx, 1.0, adds="load"), BODY, "effects.frame cannot go"),
+}  # fmt: skip
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("case", list(REFUSED_VALUES))
+def test_values_and_kinds_that_make_no_sense_are_refused(case):
+    term, tables, text = REFUSED_VALUES[case]
+    with pytest.raises(sg.fem.SceneError, match=text):
+        sg.build("paper_forward", ["tissue.cells=[2, 4]"], terms=[term], **tables)
+
+
+@pytest.mark.ranks
+def test_negative_values_are_refused_where_they_leave_no_solid_and_no_sooner():
+    model = sg.build("paper_forward", ["tissue.cells=[2, 4]"], terms=[sg.Term("bed", on_boundary, 1.0)])
+    assert model.with_parameters(bed=-0.5).states == model.states  # softer than the tissue: K stays definite
+    with pytest.raises(sg.fem.SceneError, match="bed = -10000: with that the stiffness matrix"):
+        model.with_parameters(bed=-1e4)
+
+
+@pytest.mark.ranks
+def test_springs_and_dashpots_go_with_a_hand_that_turns():
+    """In its frame, by an angle whose square is 1e-8, they are those of small angles."""
+    terms = [sg.Term("bed", on_boundary, 30.0), sg.Term("air", whole_body, 0.4, adds="damping")]
+    keys = ["effects.rotation=true", "hand.inertia=1.0", "motion.target=[0.0, 0.0, 1e-4]", "effects.damping=false"]
+    small, frame = (
+        sg.simulate(sg.build("paper_lqr", [*KEYS, *keys, *more], terms=terms))
+        for more in ([], ["effects.frame='hand'"])
+    )
+    one, two = (run.outputs - run.outputs_rigid for run in (frame, small))
+    assert np.abs(one - two).max() < 1e-3 * np.abs(two).max()  # of the order of the angle
+    assert frame.dissipated[-1] == pytest.approx(small.dissipated[-1], rel=1e-3)
