@@ -16,6 +16,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import BlockLayout, bounding_box
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from softgrasp.fem.model.patches import make_patches
@@ -226,6 +227,19 @@ def _assembled(comm: MPI.Intracomm, csr: Any, form: Any) -> PETSc.Mat:
     size = ((n * d, rows.size_global * d), (columns.size_local * d, columns.size_global * d))
     entries = (A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data)
     return PETSc.Mat().createAIJ(size, bsize=d, csr=entries, comm=comm)
+
+
+def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[LayerMaterial, ...]:
+    """Material and Kelvin-Voigt time of each layer; cells of no layer carry tissue.material."""
+    damping = scene.effects.damping
+    beta = damping.beta if damping is not None else 0.0
+    result = []
+    for blocks in layers:
+        layer = scene.tissue.layers.get(blocks.name)
+        m = scene.tissue.material if layer is None else layer.material
+        own = None if layer is None or damping is None else layer.beta
+        result.append(LayerMaterial(m.lam, m.mu, m.rho, beta if own is None else own))
+    return tuple(result)
 
 
 def layer_numbers(mesh: TissueMesh, scene: Scene) -> tuple[tuple[str, ...], np.ndarray]:

@@ -23,7 +23,15 @@ from softgrasp.fem.material import REST, LayerMaterial, in_words, of_layers
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.mesh.scene_hash import scene_hash, scene_keys
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
-from softgrasp.fem.model.assembly import Blocks, Discretisation, Inventory, assemble, discretise, make_points
+from softgrasp.fem.model.assembly import (
+    Blocks,
+    Discretisation,
+    Inventory,
+    assemble,
+    discretise,
+    layer_materials,
+    make_points,
+)
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.memory import box_simplices, check_memory
 from softgrasp.fem.model.outputs import Output, make_outputs, output_columns
@@ -254,11 +262,9 @@ class Model(Shown):
                 has = ", ".join(known) or "none"
                 raise SceneError(text or f"the model has no parameter '{key}' that it is affine in; it has {has}")
             rows = [replace(m, mu=float(value)) if m.part == key else m for m in rows]
-        system = self.system.with_materials(tuple(rows))
         if self.scene._terms:
-            terms = import_module("softgrasp.fem.model.terms")  # few scenes pay for it
-            terms.check_values(system.layers, system.materials, system.K_ee, system.M_ee)
-        return replace(self, system=system, accuracy=None)
+            import_module("softgrasp.fem.model.terms").check_values(self.system.layers, rows)  # few scenes pay for it
+        return replace(self, system=self.system.with_materials(tuple(rows)), accuracy=None)
 
 
 def checked_model(model: object) -> Model:
@@ -270,19 +276,6 @@ def checked_model(model: object) -> Model:
         return model
     shown = f'"{model}"' if isinstance(model, str) else "scene" if isinstance(model, Scene) else type(model).__name__
     raise SceneError(f"a model is needed; write softgrasp.build({shown}) where {shown} stands")
-
-
-def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[LayerMaterial, ...]:
-    """Material and Kelvin-Voigt time of each layer; cells of no layer carry tissue.material."""
-    damping = scene.effects.damping
-    beta = damping.beta if damping is not None else 0.0
-    result = []
-    for blocks in layers:
-        layer = scene.tissue.layers.get(blocks.name)
-        m = scene.tissue.material if layer is None else layer.material
-        own = None if layer is None or damping is None else layer.beta
-        result.append(LayerMaterial(m.lam, m.mu, m.rho, beta if own is None else own))
-    return tuple(result)
 
 
 def _assembled(
@@ -313,10 +306,12 @@ def _with_terms(
     materials: tuple[LayerMaterial, ...],
 ) -> tuple[tuple[LayerBlocks, ...], tuple[LayerMaterial, ...]]:
     """The same with the rows of own terms. Collective."""
-    from softgrasp.fem.model.terms import term_blocks  # only scenes with terms of their own pay for it
+    from softgrasp.fem.model.terms import check_values, term_blocks  # only scenes with terms of their own pay for it
 
     rows, values = term_blocks(space, scene, blocks, T, of_layers(materials))
-    return (*layers, *rows), (*materials, *values)
+    layers, materials = (*layers, *rows), (*materials, *values)
+    check_values(layers, materials)
+    return layers, materials
 
 
 def build(
@@ -370,8 +365,6 @@ def build(
         if scene._terms:
             layers, materials = _with_terms(space, scene, blocks, T, layers, materials)
         M_ee, K_ee = tissue_matrices(layers, materials)
-        if scene._terms:
-            import_module("softgrasp.fem.model.terms").check_values(layers, materials, K_ee, M_ee)
         G, M_rigid = coupling(layers, materials, T)
         inventory.operators += ["M_ee", "K_ee", "T", "G"]
         damping = damping_operator(scene, layers, materials)

@@ -28,7 +28,7 @@ from softgrasp.fem.model.assembly import Blocks, Discretisation
 from softgrasp.fem.petsc import PETSc, times_columns, total
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.tissue import TAKEN
-from softgrasp.fem.system import Component, LayerBlocks
+from softgrasp.fem.system import Component, LayerBlocks, tissue_matrices
 
 SYMMETRIC = 1e-10  # largest |A - A'| over |A| of a symmetric form [1]
 SEMIDEFINITE = 1e-10  # most negative eigenvalue of a form over its norm that counts as rounding [1]
@@ -120,54 +120,59 @@ def term_blocks(
     Raises SceneError: a form cannot be made, is zero or not symmetric, or joins cells across facets.
     """
     comm, found, materials = space.layout.comm, list[LayerBlocks](), list[LayerMaterial]()
-    damping = scene.effects.damping
+    beta = 0.0 if scene.effects.damping is None else rows[-1].beta
     nothing: Component | None = None
     for term in scene._terms:
-        arguments = [ufl.TestFunction(space.V)] if term.adds == "load" else [
-            ufl.TrialFunction(space.V), ufl.TestFunction(space.V)
-        ]  # fmt: skip
+        u, v = ufl.TrialFunction(space.V), ufl.TestFunction(space.V)
         with raise_on_all_ranks(comm):
-            form = _checked(term, arguments)
+            form = _checked(term, [v] if term.adds == "load" else [u, v])
         with raise_on_all_ranks(comm):
             compiled = _compiled(term, form)
         nothing = nothing or _nothing(space, blocks, T)
-        if term.adds == "load":
-            load = _load(space, compiled, scene.tissue.thickness, T)
-            own, size = nothing, math.sqrt(total(comm, np.array([load[0] @ load[0]]))[0] + load[1] @ load[1])
-        else:
-            load, own = None, blocks.whole(form)
-            size = own.ee.norm(PETSc.NormType.FROBENIUS)
-        if not 0 < size < math.inf:
-            raise SceneError(
-                f"the term {term.name} adds {'nothing' if size == 0 else 'no finite number'} to the {term.adds}; check "
-                "its form, and that a tag of its measure (subdomain_data) is in the mesh"
-            )
-        definite = True
-        if load is None:
-            if not own.ee.isSymmetric(SYMMETRIC * own.ee.norm(PETSc.NormType.INFINITY)):
-                raise SceneError(f"the term {term.name} is not symmetric in u and v; a spring has an energy")
-            definite = _positive(own.ee, SEMIDEFINITE * size)
-        if term.adds in ("stiffness", "damping"):  # which a rigid move does not feel
-            moved = times_columns(own.ee, T)
-            own = Component(own.ee, -moved, total(comm, T.T @ moved))
-        term.digest = _digest(term, form, size, own, load, space)
-        place = "M_1" if term.adds == "mass" else "K_mu"
-        parts = {key: own if key == place else nothing for key in ("K_mu", "K_lambda", "M_1")}
-        found.append(LayerBlocks(f"term.{term.name}", **parts, load=load, definite=definite))
-        beta = 0.0 if damping is None else rows[-1].beta
+        found.append(_row(term, form, compiled, space, blocks, nothing, scene.tissue.thickness, T))
         materials.append(LayerMaterial(0.0, float(term.value), rows[0].rho, beta, term.name, adds=term.adds))
     return tuple(found), tuple(materials)
 
 
-def check_values(layers: Sequence[LayerBlocks], materials: Sequence[LayerMaterial], K: PETSc.Mat, M: PETSc.Mat) -> None:
+def _row(
+    term: Term, form: Any, compiled: Any, space: Discretisation, blocks: Blocks, nothing: Component, thickness: float,
+    T: Any,
+) -> LayerBlocks:  # fmt: skip
+    """The blocks of a term; sets its digest. Collective."""
+    comm, definite, load, own = space.layout.comm, True, None, nothing
+    if term.adds == "load":
+        load = _load(space, compiled, thickness, T)
+        size = math.sqrt(total(comm, np.array([load[0] @ load[0]]))[0] + load[1] @ load[1])
+    else:
+        own = blocks.whole(form)
+        size = own.ee.norm(PETSc.NormType.FROBENIUS)
+    if not 0 < size < math.inf:
+        raise SceneError(
+            f"the term {term.name} adds {'nothing' if size == 0 else 'no finite number'} to the {term.adds}; check "
+            "its form, and that a tag of its measure (subdomain_data) is in the mesh"
+        )
+    if load is None:
+        if not own.ee.isSymmetric(SYMMETRIC * own.ee.norm(PETSc.NormType.INFINITY)):
+            raise SceneError(f"the term {term.name} is not symmetric in u and v; a spring has an energy")
+        definite = _positive(own.ee, SEMIDEFINITE * size)
+    if term.adds in ("stiffness", "damping"):  # which a rigid move does not feel
+        moved = times_columns(own.ee, T)
+        own = Component(own.ee, -moved, total(comm, T.T @ moved))
+    term.digest = _digest(term, form, size, own, load, space)
+    place = "M_1" if term.adds == "mass" else "K_mu"
+    parts = {key: own if key == place else nothing for key in ("K_mu", "K_lambda", "M_1")}
+    return LayerBlocks(f"term.{term.name}", **parts, load=load, definite=definite)
+
+
+def check_values(layers: Sequence[LayerBlocks], materials: Sequence[LayerMaterial]) -> None:
     """Refuse values of own terms with which stiffness or mass is not positive definite, or damping feeds energy.
 
     A factor is made only where a value is negative or a form is not semidefinite. Collective.
     """
-    for adds, A in (("stiffness", K), ("mass", M)):
+    for i, adds in enumerate(("mass", "stiffness")):
         rows = [(x, m) for x, m in zip(layers, materials, strict=True) if m.adds == adds]
         doubtful = [m for x, m in rows if m.mu < 0 or not (x.definite or m.mu == 0)]
-        if doubtful and not _positive(A):
+        if doubtful and not _positive(tissue_matrices(tuple(layers), tuple(materials))[i]):
             values = ", ".join(f"{m.part} = {m.mu:g}" for m in doubtful)
             raise SceneError(
                 f"{values}: with that the {adds} matrix {MATRIX[adds]} is not positive definite, so that {ACTS[adds]}; "

@@ -43,10 +43,9 @@ class FiniteStrainMidpoint(TissueMidpoint):
     """
 
     def _parts(self) -> tuple[PETSc.Mat, ...]:
-        parts, springs = [combine([(self.s * self.s, self.system.M_ee)])], self.system.springs
-        if self.system.damping.active:
-            parts.append(viscosity(self.system, self.s))
-        return (*parts, *([] if springs is None else [springs]))
+        system, springs = self.system, self.system.springs
+        drag = [viscosity(system, self.s)] if system.damping.active else []
+        return (combine([(self.s * self.s, system.M_ee)]), *drag, *([] if springs is None else [springs]))
 
     def _prepare(self) -> None:
         """Points, vectors and iteration. Collective."""
@@ -55,8 +54,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
         if self.comm.size > 1 and not self.operators.whole:
             self.dot = lambda a, b: self.over_ranks(float(np.dot(a, b)))
         self.body, self.tol = self._make_body()
-        self.inertia, *others = self.operators.parts
-        self.drag = others[0] if self.system.damping.active else None
+        self.inertia, drag = (*self.operators.parts, None)[:2]
+        self.drag = drag if self.system.damping.active else None
         for part in self.operators.parts:
             part.convert("aij")
         self.trial, self.f, self.y, self.solved = (self.w.duplicate() for _ in range(4))
@@ -78,10 +77,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
         assert points is not None
         if self.operators.whole:
             points = whole_points(points, self.comm, self.operators.enter(np.arange(system.layout.n_e)))
-        count = 2 if system.damping.active else 1
-        springs = self.operators.parts[count] if len(self.operators.parts) > count else None
-        pattern = None if self.operators.whole else system.K_ee
-        body = HyperelasticBody(points, system.materials, pattern, springs)
+        springs = (*self.operators.parts, None)[1 + system.damping.active]
+        body = HyperelasticBody(points, system.materials, None if self.operators.whole else system.K_ee, springs)
         if not self.comm.allreduce(body.kernel is not None, MPI.LAND):
             body.kernel = None  # ranks that store all rows compute the same bits
         return body, points.tol
@@ -210,10 +207,6 @@ class FiniteStrainMidpoint(TissueMidpoint):
         counts.iterations_since_factor += max(root.iterations - counts.first, 0)
         counts.iterations, counts.steps = counts.iterations + root.iterations, counts.steps + 1
         counts.most = max(counts.most, root.iterations)
-
-    def _load(self, c: Array) -> Array:
-        """G c and the load of own terms on the rows here [N]."""
-        return np.asarray(self.G @ c if self.own is None else self.G @ c + self.own)
 
     def _find(self, guess: Array) -> Root:
         """The root, moved to w'R = 0 by a small fraction of an earlier correction. Collective."""

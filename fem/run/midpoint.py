@@ -234,6 +234,10 @@ class TissueMidpoint:
         self.c = c
         self._solve(self.r, self.w)
 
+    def _load(self, c: Array) -> Array:
+        """G c and the load of own terms on the rows here [N]."""
+        return np.asarray(self.G @ c + (0.0 if self.own is None else self.own))
+
     def respond(self) -> Array:
         """Solve S w = h, the step without a load; the owned rows of w. Collective."""
         self.solve_midpoint(np.zeros_like(self.c))
@@ -353,7 +357,7 @@ class TissueMidpoint:
         In equilibrium under gravity the load cancels in r, and a two-way step subtracts the hand's part from w: what is
         left is small against the load, not against the rounding in r.
         """
-        load = self.G[self.rows] @ self.c + (0.0 if self.own is None else self.own[self.rows])
+        load = self._load(self.c)[self.rows]
         square = total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]
         with self.operators.raise_on_all_ranks():
             return self.solver.check(self.r, self.w, "the midpoint", float(np.sqrt(square)))

@@ -151,6 +151,8 @@ def _not_planned(problem: RiccatiProblem) -> str:
         return "a hand that neither turns nor feels the tissue; set effects.reaction and effects.rotation to false"
     if system.points is not None:
         return "the linear plant; leave out effects.finite_strain"
+    if system.own_load is not None:
+        return "tissue under gravity alone; leave out the terms that add a load"
     if system.damping.matrix is not None or system.damping.drag:
         return "damping that is the same in all layers and acts against the hand"
     if layout.n_e > DENSE_LIMIT:

@@ -305,8 +305,6 @@ def require_plan(model: Model) -> None:
     _given_force(model, plant.layout.n_s)
     if model.system.gravity is not None and model.scene.time.start != "equilibrium":
         raise ControlError(SWINGS)
-    if model.system.own_load is not None:
-        raise ControlError("a plan knows gravity and no own load; leave out the terms that add a load")
 
 
 def fixed_obstacles(model: Model) -> tuple[Obstacle, ...]:
