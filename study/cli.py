@@ -207,9 +207,11 @@ def view(
     field: Annotated[str, typer.Option(help="colour: von_mises, displacement, velocity, stress, strain, layer")] = (
         "von_mises"
     ),
-    save: Annotated[Path | None, typer.Option(help="write a PNG instead of opening a window")] = None,
+    save: Annotated[
+        Path | None, typer.Option(help="write a PNG, or a page (.html) to turn it in; no window then")
+    ] = None,
 ) -> None:
-    """Show the move of a run with PyVista: a window with a time slider, or a picture."""
+    """Show the move of a run: a window with a time slider, a picture, or a page that turns it."""
     from softgrasp.study.pictures.view import view as show
     from softgrasp.study.shell.session import list_files
 

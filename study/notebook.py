@@ -1,4 +1,4 @@
-"""Figures of objects for a notebook: what their ``plot``, ``bode``, ``plot_errors`` and ``animate`` return.
+"""Figures of objects for a notebook: what their ``plot``, ``bode``, ``plot_errors``, ``animate`` and ``view3d`` return.
 
 Figures belong to no window: a notebook shows them where they are the last value of a cell, ``savefig`` writes them.
 """
@@ -6,6 +6,7 @@ Figures belong to no window: a notebook shows them where they are the last value
 from __future__ import annotations
 
 import base64
+import html
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import scipy.linalg
 
-from softgrasp.fem import Array, Model, OutputColumn, ReducedSystem, SoftgraspError, Trajectory
+from softgrasp.fem import Array, Model, OutputColumn, PictureMesh, ReducedSystem, SoftgraspError, Trajectory
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
 from softgrasp.lqr import LoopMargins, LoopTrajectory
 from softgrasp.reduction import ReducedModel, ReducedTrajectory
@@ -23,6 +24,7 @@ from softgrasp.study.control.plots import bode
 from softgrasp.study.pictures import MOST_FRAMES, histories, move_bytes
 from softgrasp.study.pictures.style import CYCLE, FULL, WIDTH, length_unit, log_axis, paper_style
 from softgrasp.study.pictures.traces import traces
+from softgrasp.study.pictures.turning import Scene3D
 
 FREQUENCIES = 800  # of a Bode diagram, even in log w
 
@@ -121,18 +123,64 @@ class Film:
         return f'<img alt="the move" src="data:image/gif;base64,{base64.b64encode(self.gif).decode()}">'
 
 
+@dataclass(frozen=True)
+class View:
+    """A move to turn, zoom and play; notebooks show it."""
+
+    html: str  # the page
+
+    def save(self, file: str | Path) -> Path:
+        """Write it as a page of the browser and return its path."""
+        Path(file).write_text(self.html, encoding="utf-8")
+        return Path(file)
+
+    def __repr__(self) -> str:
+        return f"View of {len(self.html) / 1e6:.1f} MB; save it by view.save('move.html')"
+
+    def _repr_html_(self) -> str:
+        look = 'style="width:100%;height:30rem;border:0" title="the move, to turn and play"'
+        return f'<iframe {look} srcdoc="{html.escape(self.html)}"></iframe>'
+
+
+def view3d(run: Trajectory, model: Model) -> View:
+    """The move to turn, zoom and play, without obstacles. Collective; rank 0 draws, the others get an empty page.
+
+    Raises SoftgraspError: the run kept no snapshots.
+    """
+    picture, states, hands, times = _shown(run, model)
+    if picture is None or states is None:
+        return View("")
+    sizes = np.array([np.linalg.norm(u - picture.rigid(q), axis=1) for u, q in zip(states, hands, strict=True)])
+    factor, unit = length_unit(float(sizes.max()))
+    flat = picture.dimension == 2
+    points = np.pad(picture.points + states.astype(np.float64), ((0, 0), (0, 0), (0, 3 - picture.dimension)))
+    return View(
+        Scene3D(
+            picture.cells if flat else picture.facets, points, factor * sizes, list(times),
+            [f"{t:.3g} s" for t in times], f"displacement relative to the hand [{unit}]",
+            (0.0, factor * float(sizes.max())), flat=flat,
+        ).html()
+    )  # fmt: skip
+
+
 def animation(run: Trajectory, model: Model) -> Film:
     """The move as an animated picture. Collective; rank 0 draws, the others get an empty film.
 
     Raises SoftgraspError: the run kept no snapshots.
     """
+    picture, states, _, times = _shown(run, model)
+    if picture is None or states is None:
+        return Film(b"")
+    table: Array = np.column_stack([run.times, run.q_s])
+    return Film(move_bytes(picture, states, times, table, model.scene.motion.target))
+
+
+def _shown(run: Trajectory, model: Model) -> tuple[PictureMesh | None, Array | None, Array, Array]:
+    """The body, displacements (k, n, d) [m], hands (k, n_s) and times (k,) [s] of at most 60 instants. Collective."""
     kept = run.snapshots
     if kept is None:
         raise SoftgraspError("the run kept no snapshots in memory; set output.snapshots = 'memory'")
     pick = np.unique(np.linspace(0, len(kept.steps) - 1, MOST_FRAMES).round().astype(int))
     n = kept.layout.n_local
-    picture, states = gather_picture(model), vertex_displacement(model, kept.Z[:n, pick], kept.q_s[:, pick])
-    if picture is None or states is None:
-        return Film(b"")
-    table: Array = np.column_stack([run.times, run.q_s])
-    return Film(move_bytes(picture, states, kept.times[pick], table, model.scene.motion.target))
+    states = vertex_displacement(model, kept.Z[:n, pick], kept.q_s[:, pick])
+    return gather_picture(model), states, kept.q_s[:, pick].T, kept.times[pick]

@@ -19,6 +19,7 @@ import softgrasp as sg
 from benchmarks.__main__ import app as bench_app
 from softgrasp.fem.scene.file import find_scene, load_scene
 from softgrasp.study.cli import app
+from softgrasp.study.runs.start import new_scene
 from tests.hardcases.__main__ import app as hardcases_app
 
 pytestmark = pytest.mark.serial
@@ -115,6 +116,19 @@ def test_command_has_real_options_scenes_and_keys(line: str) -> None:
     scene = context.params.get("scene")
     if scene is not None and str(scene) not in ("block.toml", "strip.toml"):
         load_scene(find_scene(scene), context.params.get("set_") or [])
+
+
+def test_jobs_of_the_cluster_page_have_real_scenes_and_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What only a cluster starts: each scene loads with the keys that are set, the variables of the job filled in."""
+    monkeypatch.chdir(tmp_path)
+    new_scene(Path("block.toml"), solid=True)
+    jobs = [line.partition("softgrasp ")[2] for _, line in lines() if line.startswith("srun ")]
+    assert len(jobs) > 1
+    for job in jobs:
+        words = shlex.split(re.sub(r" \$resume", "", re.sub(r"\$\{mu\[\$\w+\]\}", "100", job)))
+        command = typer.main.get_command(app).commands[words[0]]  # type: ignore[attr-defined]
+        context = command.make_context(job, words[1:], resilient_parsing=False)
+        load_scene(find_scene(context.params["scene"]), context.params.get("set_") or [])
 
 
 def small(words: list[str]) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import re
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -117,6 +119,12 @@ def test_figures_show_what_the_objects_hold(objects: dict[str, Any], tmp_path: P
         assert picture.n_frames > 10
     with pytest.raises(SoftgraspError, match="kept no snapshots"):
         replace(run, snapshots=None).animate(objects["model"])
+    view = run.view3d(objects["model"])
+    assert view.save(tmp_path / "move.html").read_text() == view.html
+    assert '<canvas id="c"' in view.html
+    assert re.search(r"relative to the hand \[m?m\]", view.html)
+    assert re.fullmatch(r"View of \d.\d MB; .*", repr(view))
+    assert html.unescape(view._repr_html_().split('srcdoc="')[1].split('">')[0]) == view.html
 
 
 def test_a_sweep_from_python_is_the_runs_one_by_one() -> None:

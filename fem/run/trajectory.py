@@ -108,3 +108,10 @@ class Trajectory(Shown, FullOrderRun):
         Raises SoftgraspError: the run kept no snapshots.
         """
         return drawn("animation", self, model)
+
+    def view3d(self, model: Model) -> Any:
+        """The move on the mesh of its model to turn, zoom and play in a notebook, with ``save`` as a page. Collective.
+
+        Obstacles are not drawn. Raises SoftgraspError: the run kept no snapshots.
+        """
+        return drawn("view3d", self, model)

@@ -286,7 +286,9 @@ class Scene(Shown, Section):
     def _check(self) -> Scene:
         effects = self.effects
         if effects.rotation and self.hand.inertia is None:
-            raise ValueError("hand.inertia is missing; effects.rotation needs it")
+            raise ValueError(
+                "hand.inertia is missing; effects.rotation needs it [kg m2], in 3D one number or [x, y, z]"
+            )
         if effects.rotation and effects.finite_strain is not None and effects.frame is None:
             raise ValueError(
                 "effects.finite_strain cannot go with effects.rotation, whose linearised turns would stretch the "

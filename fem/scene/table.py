@@ -12,7 +12,7 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.text import read_table
 
-TURNING, POSE = 6, 7  # values in a row: displacement and angles in 3D; place and quaternion
+FIXED, TURNING, POSE = 3, 6, 7  # values in a row in 3D: displacement; and angles; place and quaternion
 NORM = 1e-3  # deviation of a quaternion's norm from one that digits of a file explain; a wrong column is further off
 
 
@@ -25,10 +25,12 @@ def read_motion(scene: Scene, n_s: int) -> tuple[NDArray[Any], NDArray[Any]]:
     Raises SceneError: the file does not fit.
     """
     name = scene.motion.csv or ""
-    posed = n_s == TURNING and scene.motion.drive == "motion"
+    moved = scene.motion.drive == "motion"
+    posed = n_s == TURNING and moved
+    poses = ", or x, y, z and a quaternion w, x, y, z" if posed else "; poses need effects.rotation = true"
     times, values = read_csv(
         scene.directory / name, n_s, scene.time_end, also=POSE if posed else None,
-        meaning="one per hand degree of freedom" + ", or x, y, z and a quaternion w, x, y, z" * posed,
+        meaning="one per hand degree of freedom" + poses * (posed or (moved and n_s == FIXED)),
     )  # fmt: skip
     if values.shape[1] == n_s:
         return times, values

@@ -86,7 +86,7 @@ def load_plugins(files: Sequence[Path]) -> tuple[str, ...]:
     keys = []
     for file in files:
         if not file.is_file():
-            raise BasisError(f"{file}: there is no such file; reduction.plugins names Python files")
+            raise BasisError(f"{file}: there is no such file; plugins are Python files, from the scene's folder")
         try:
             found = runpy.run_path(str(file), run_name=f"softgrasp_plugin_{file.stem}").get("METHODS")
         except Exception as error:

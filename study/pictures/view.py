@@ -83,6 +83,29 @@ class Move:
         x = np.asarray(self.body(i).points)
         return solids(self._obstacles, self.times[i], np.array([x.min(axis=0), x.max(axis=0)]), self.flat)
 
+    def page(self) -> str:
+        """The whole move as a page of the browser; with obstacles as far as they are near the way."""
+        from softgrasp.study.pictures.turning import Scene3D  # a window does without
+
+        bodies = [self.body(i).triangulate() for i in range(len(self.times))]
+        triangles = bodies[0].faces.reshape(-1, 4)[:, 1:]
+        points = np.array([body.points for body in bodies], dtype=np.float64)
+        data = [body.point_data if "value" in body.point_data else body.cell_data for body in bodies]
+        around: list[np.ndarray] = []
+        if self._obstacles:
+            from softgrasp.study.pictures.solids import solids  # few scenes have any
+
+            box = np.array([points.min(axis=(0, 1)), points.max(axis=(0, 1))])
+            moving = any(obstacle.path is not None for obstacle in self._obstacles)
+            for t in self.times if moving else self.times[:1]:
+                mesh = solids(self._obstacles, t, box, self.flat)
+                faces = None if mesh is None else mesh.triangulate().faces.reshape(-1, 4)[:, 1:]
+                around.append(np.zeros((0, 3, 3)) if faces is None else np.asarray(mesh.triangulate().points)[faces])
+        return Scene3D(
+            triangles, points, np.array([each["value"] for each in data]), self.times,
+            [self.label(i) for i in range(len(self.times))], self.title, self.range, around, self.flat,
+        ).html()  # fmt: skip
+
     def label(self, i: int) -> str:
         """Time and place of the hand."""
         hand = np.asarray(self._read(i).field_data["hand"])
@@ -127,13 +150,16 @@ def _series(path: Path) -> list[tuple[float, Path, str]]:
 
 
 def view(folder: Path, field: str, save: Path | None) -> None:
-    """Show the move in a window with a time slider, or save a picture of some instants.
+    """Show the move in a window with a time slider, or save a picture of some instants, or a page that turns it.
 
-    Raises SceneError: there is no display, or the picture is no PNG, or as for `Move`.
+    Raises SceneError: there is no display, or the file is neither PNG nor HTML, or as for `Move`.
     """
-    if save is not None and save.suffix != ".png":
-        raise SceneError(f"--save {save}: the picture is a PNG; name a file that ends in .png")
+    if save is not None and save.suffix not in (".png", ".html"):
+        raise SceneError(f"--save {save}: a picture is a PNG, a page that turns it HTML; end the name in .png or .html")
     move = Move(folder, field)
+    if save is not None and save.suffix == ".html":
+        save.write_text(move.page(), encoding="utf-8")
+        return
     if save is None and "vtkEGL" in os.environ.get("VTK_DEFAULT_OPENGL_WINDOW", ""):
         raise SceneError("there is no display here for a window; give --save move.png")
     import pyvista

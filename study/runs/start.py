@@ -31,7 +31,7 @@ material = "muscle" # `softgrasp materials`, or {{ young = 2.0e4, poisson = 0.45
 {contact}
 
 [hand]
-mass = 0.73 # [kg]
+mass = 0.73 # [kg]; with effects.rotation also inertia [kg m2]
 
 [effects] # what is not named is off and costs nothing: gravity, damping, reaction, rotation, finite_strain
 gravity = {{ g = {g} }} # [m/s2]

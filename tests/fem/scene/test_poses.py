@@ -71,3 +71,6 @@ def test_forces_and_plane_hands_have_no_poses(tmp_path: Path, comm: MPI.Intracom
     path = save(tmp_path / "poses.csv", np.array([0.0, 1.0]), np.tile([0.0, 0, 0, 1, 0, 0, 0], (2, 1)))
     with pytest.raises(SceneError, match="has 8 entries in data row 1; it must have 7 columns"):
         build(path, comm, drive="force")
+    keys = {**KEYS, "effects": {"rotation": False}, "motion": KEYS["motion"] | {"csv": str(path)}}
+    with pytest.raises(SceneError, match=r"4 columns .*; poses need effects.rotation = true"):
+        sg.build("block_3d", comm=comm, **keys)

@@ -130,7 +130,7 @@ REFUSED: list[tuple[Path, list[str], str]] = [
     (PAPER, ["control.R=[[1.0]]"], "control.R has 1 rows; it must have 2"),
     (PAPER, ["hand.inertia=[1, 1, 1]"], "hand.inertia is a list; in 2D it must be one number"),
     # effects, motion, control
-    (PAPER, ["effects.rotation=true", "motion.target=[1, 2, 0]"], "hand.inertia is missing; effects.rotation needs it"),
+    (PAPER, ["effects.rotation=true", "motion.target=[1, 2, 0]"], "hand.inertia is missing; effects.rotation"),
     (
         PAPER,
         ["effects.damping={kind='kelvin-voigt', beta=1.0, alpha=1.0}"],

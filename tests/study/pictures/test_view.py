@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import importlib.util
+import json
+import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +19,7 @@ from rich.console import Console
 from softgrasp.fem.errors import ResourceError, SceneError
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.study.forward.run import run_simulate
+from softgrasp.study.pictures.turning import Scene3D
 from softgrasp.study.pictures.view import Move, view
 
 needs_pyvista = pytest.mark.skipif(importlib.util.find_spec("pyvista") is None, reason="no PyVista here")
@@ -59,6 +64,51 @@ def test_picture_shows_four_bodies(two_legs: Path, tmp_path: Path) -> None:
     assert not np.array_equal(pixels[:, :320], pixels[:, 320:640])
 
 
+def page_data(page: str) -> dict[str, Any]:
+    """What a page draws: places (k, n, 3) [m] and the rest, as the browser reads it."""
+    assert re.findall(r"(?:src|href|url)\s*[=(]", page.split("<script>")[0]) == []  # nothing is loaded
+    assert re.findall(r"https?:|fetch|import", page) == []
+    data = json.loads(re.findall(r'type="application/json" id="data">(.*?)</script>', page, re.DOTALL)[0])
+    kinds = {"triangles": "<u4", "points": "<u2", "values": np.uint8, "colours": np.uint8}
+    data |= {key: np.frombuffer(base64.b64decode(data[key]), kind) for key, kind in kinds.items()}
+    data["points"] = data["low"] + data["step"] * data["points"].reshape(len(data["times"]), -1, 3)
+    data["obstacles"] = [np.frombuffer(base64.b64decode(x), "<f4").reshape(-1, 3, 3) for x in data["obstacles"]]
+    return data
+
+
+@needs_pyvista
+def test_a_page_has_every_place_value_and_instant(two_legs: Path, tmp_path: Path) -> None:
+    """Against the field files: places to half a step of 16 bits, values to half a colour."""
+    view(two_legs, "von_mises", tmp_path / "move.html")
+    data = page_data((tmp_path / "move.html").read_text())
+    move = Move(two_legs, "von_mises")
+    assert data["times"] == pytest.approx(move.times)
+    assert data["labels"][-1] == "3 s, hand at (5, 3) m"
+    assert (data["stride"], data["by_cell"], data["obstacles"]) == (36, True, [])
+    for i in (0, 3, 6):
+        body = move.body(i)
+        np.testing.assert_allclose(data["points"][i], body.points, atol=0.51 * data["step"])
+        low, high = move.range
+        share = np.clip((body.cell_data["value"] - low) / (high - low), 0, 1)
+        np.testing.assert_allclose(data["values"].reshape(7, 36)[i] / 255, share, atol=0.51 / 255)
+    corners = data["points"][0][data["triangles"].reshape(-1, 3)]
+    sides = corners[:, 1:, :2] - corners[:, :1, :2]
+    assert abs(np.linalg.det(sides)).sum() / 2 == pytest.approx(2.0, rel=1e-3)  # area of the strip; rounding of places
+
+
+def test_a_page_thins_out_instants_and_keeps_what_moves_beside_the_body(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("softgrasp.study.pictures.turning.MOST_BYTES", 6 * 4 * 3)  # room for three instants
+    triangle, times = np.array([[0, 1, 2], [0, 2, 3]]), np.arange(5.0)
+    points = times[:, None, None] + np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    walls = [np.full((1, 3, 3), t) for t in times]
+    scene = Scene3D(triangle, points, points[..., 0], list(times), ["</script>"] * 5, "x [m]", (0.0, 5.0), walls)
+    data = page_data(scene.html())
+    assert (data["times"], data["by_cell"], data["slower"]) == ([0.0, 2.0, 4.0], False, 1.0)
+    assert [float(x.max()) for x in data["obstacles"]] == [0.0, 2.0, 4.0]
+    np.testing.assert_allclose(data["points"], points[::2], atol=0.51 * data["step"])
+    assert data["labels"] == ["</script>"] * 3  # no tag ends the data
+
+
 @needs_pyvista
 def test_obstacles_are_shown_where_they_are() -> None:
     """Beside a body from 0 to 1: a table half a unit below, a disc that moves, and a ball too far away to be shown."""
@@ -90,7 +140,7 @@ def test_refusals(two_legs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(SceneError, match="no display here"):
         view(two_legs, "von_mises", None)
-    with pytest.raises(SceneError, match=r"ends in \.png"):
+    with pytest.raises(SceneError, match=r"move\.jpg: .*end the name in \.png or \.html"):
         view(two_legs, "von_mises", Path("move.jpg"))
     with pytest.raises(SceneError, match="--field heat: the files contain displacement, held, layer"):
         Move(two_legs, "heat")
