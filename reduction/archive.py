@@ -24,11 +24,13 @@ from softgrasp.fem.resources import MARGIN, reserve_room
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.operators import Reconstruction
 from softgrasp.reduction.system import ModelError, Outputs
+from softgrasp.reduction.turning.model import TurningModel
 
 if TYPE_CHECKING:
     from softgrasp.reduction.strain.model import StrainModel
 
 LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 3"
+TURNING = "softgrasp reduced model in the frame of the hand 1"
 # what h5py and the reading of a model raise of a file that is not whole
 DAMAGE = (OSError, LookupError, TypeError, ValueError, RuntimeError, AttributeError, MemoryError)
 GROUP = "reconstruction"  # of the rows on the mesh; its checksum is an attribute sha256_reconstruction
@@ -42,6 +44,9 @@ LINEAR_KEYS = (
 STRAIN_KEYS = (
     "cells_full", "alpha", "in_space", "tau", "residual", "error_galerkin", "scene_hash", "origin", "seconds",
 )  # fmt: skip
+TURNING_KEYS = (
+    "name", "sizes", "alpha", "damped", "hand_weight", "two_way", "scene_hash", "origin", "seconds",
+)  # fmt: skip
 STRAIN_ARRAYS = {
     "cells": ("B", "weight", "xi", "layer", "cell", "centre"),
     "box": ("lam", "mu", "load", "reach"),
@@ -52,7 +57,7 @@ FINER_ARRAYS = ("K_mu", "K_lambda", "G", "gram")
 FIELDS = {"tau": "cubature_tolerance", "residual": "cubature_residual", "reach": "largest_coordinates"}
 
 
-def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
+def save(model: ReducedModel | StrainModel | TurningModel, path: str | Path) -> None:
     """Write a reduced model to one HDF5 file, atomically. Collective when the model has a reconstruction.
 
     The file has the small matrices in full precision, the outputs, and the reconstruction (2 or 3 arrays of n_e x N)
@@ -76,25 +81,28 @@ def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
     if isinstance(model, ReducedModel):
         kind, reconstruction = LINEAR, model.reconstruction
     else:
-        kind, reconstruction = STRAIN, None
+        kind, reconstruction = TURNING if isinstance(model, TurningModel) else STRAIN, None
         if model.Phi is not None and model.layout is not None:
             reconstruction = Reconstruction(model.layout, model.Phi, model.Phi[:, :0])
     write_model(Path(path), kind, about(model), reconstruction, partial(write_small, model))
 
 
-def about(model: ReducedModel | StrainModel) -> dict[str, Any]:
+def about(model: ReducedModel | StrainModel | TurningModel) -> dict[str, Any]:
     """Description of a model in JSON, for its file."""
     linear = isinstance(model, ReducedModel)
-    keys = LINEAR_KEYS if linear else STRAIN_KEYS
+    keys = LINEAR_KEYS if linear else TURNING_KEYS if isinstance(model, TurningModel) else STRAIN_KEYS
     data: dict[str, Any] = {key: getattr(model, FIELDS.get(key, key)) for key in keys}
     data |= {"materials": [asdict(m) for m in model.materials], "names": list(model.outputs.names)}
-    return data if isinstance(model, ReducedModel) else data | {"law": model.cells.law}
+    return data if isinstance(model, ReducedModel | TurningModel) else data | {"law": model.cells.law}
 
 
-def write_small(model: ReducedModel | StrainModel, file: h5py.File) -> None:
+def write_small(model: ReducedModel | StrainModel | TurningModel, file: h5py.File) -> None:
     """The arrays of a model that are no reconstruction."""
+    groups: dict[str, dict[str, Array]]
     if isinstance(model, ReducedModel):
         groups = {"parts": model.parts}
+    elif isinstance(model, TurningModel):
+        groups = {"parts": model.parts, "hand": {"M_hand": model.M_hand}}
     else:
         groups = {
             group: {
@@ -115,8 +123,8 @@ def write_small(model: ReducedModel | StrainModel, file: h5py.File) -> None:
 
 def load(
     path: str | Path, layout: BlockLayout | None = None, scene_hash: str | None = None
-) -> ReducedModel | StrainModel:
-    """Read a reduced model of either kind. Collective over ``layout.comm``; without a layout each caller for itself.
+) -> ReducedModel | StrainModel | TurningModel:
+    """Read a reduced model of any kind. Collective over ``layout.comm``; without a layout each caller for itself.
 
     Args:
         path: file of :func:`save`.
@@ -133,7 +141,8 @@ def load(
     True
     """
     with reading(Path(path), layout, scene_hash) as (file, data):
-        return (read_strain if file.attrs["format"] == STRAIN else read_linear)(file, data, layout)
+        readers = {STRAIN: read_strain, TURNING: read_turning}
+        return readers.get(file.attrs["format"], read_linear)(file, data, layout)
 
 
 def read_linear(file: h5py.File, data: dict[str, Any], layout: BlockLayout | None) -> ReducedModel:
@@ -165,6 +174,16 @@ def read_strain(file: h5py.File, data: dict[str, Any], layout: BlockLayout | Non
     )  # fmt: skip
 
 
+def read_turning(file: h5py.File, data: dict[str, Any], layout: BlockLayout | None) -> TurningModel:
+    """The same in the frame of the hand."""
+    shared, sizes = _read_shared(file, data), tuple(data.pop("sizes"))
+    parts = {key: value[()] for key, value in file["parts"].items()}
+    Phi = None if layout is None else np.asarray(read_reconstruction(file, layout).L_q)
+    return TurningModel(
+        parts=parts, M_hand=file["hand/M_hand"][()], sizes=sizes, **shared, **data, layout=layout, Phi=Phi
+    )
+
+
 def _read_shared(file: h5py.File, data: dict[str, Any]) -> dict[str, Any]:
     outputs = Outputs(file["outputs/C_z"][()], file["outputs/C_s"][()], tuple(data.pop("names")))
     materials = tuple(LayerMaterial(**m) for m in data.pop("materials"))
@@ -179,7 +198,7 @@ def write_model(
     reconstruction: Reconstruction | None,
     small: Callable[[h5py.File], None],
 ) -> None:
-    """Write a file of kind :data:`LINEAR` or :data:`STRAIN` beside its place and move it there whole.
+    """Write a file of one of these kinds beside its place and move it there whole.
 
     Collective with a reconstruction, whose rows every rank adds in turn; ``small`` writes the arrays.
 
@@ -238,7 +257,7 @@ def reading(
     with raise_on_all_ranks(comm):
         try:
             with h5py.File(no_pipe(path), "r") as file:
-                if file.attrs.get("format") not in (LINEAR, STRAIN):
+                if file.attrs.get("format") not in (LINEAR, STRAIN, TURNING):
                     raise ModelError(f"{path} is no reduced model of this version ({LINEAR!r}); reduce the scene again")
                 # one rank reads a reconstruction twice, not all of them
                 for rows in (False, True) if layout is not None and comm.rank == 0 else (False,):

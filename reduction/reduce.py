@@ -20,6 +20,7 @@ from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.origin import origin_of
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, as_full, errors_linear, replay_linear
+from softgrasp.reduction.turning.model import TurningModel, TurningRun
 
 if TYPE_CHECKING:  # only scenes with finite strain pay for its models
     from softgrasp.fem.model.build import Model
@@ -36,11 +37,12 @@ def reduce(
     *,
     inner: InnerName | None = None,
     engine: EngineName = "tsqr",
-) -> ReducedModel | StrainModel:
+) -> ReducedModel | StrainModel | TurningModel:
     """Reduced model of a scene, from the snapshots of one full run or of several. Collective.
 
         E x' = A x + B u + F g, y = C x                            linear elasticity, x = V'X of the method's basis
         a'' + D a' + dW_r/da = -G (a_s - g), y = C_z a + C_s q_s   effects.finite_strain, z = Phi a on sampled cells
+        M a'' + D a' + K a = -G (A - g) + loads of the turn        effects.frame, see `reduction.turning.model`
 
     >>> import softgrasp as sg
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
@@ -59,12 +61,14 @@ def reduce(
     Args:
         model: scene. A linear reduced model is affine in its materials, see
             :meth:`softgrasp.reduction.model.ReducedModel.at`; one at finite strain answers inside the box of materials
-            and motions of its runs, see :meth:`softgrasp.reduction.strain.model.StrainModel.at`.
+            and motions of its runs, see :meth:`softgrasp.reduction.strain.model.StrainModel.at`; one in the frame of
+            the hand at all materials, turns and forces, see :meth:`softgrasp.reduction.turning.model.TurningModel.at`.
         runs: full run of the scene, or several, with the snapshots in memory.
         method: "global_pod", "componentwise_pod", "pod_fixed", "componentwise_pod_fixed", "psd", "psd_fixed",
             "psd_cotangent_lift", "psd_svd_like" and their "_fixed" and "_relative" forms, or "craig_bampton"; all keys
             in :data:`softgrasp.reduction.bases.registry.METHODS`. None is the paper's PSD with fixed solid modes
-            "psd_fixed" [SBRH21]; at finite strain there is one basis only, the cotangent lift.
+            "psd_fixed" [SBRH21]; at finite strain there is one basis only, the cotangent lift. With effects.frame it is
+            "craig_bampton" (None too) or "psd_cotangent_lift_fixed_relative".
         N: dimension, the hand's 2 n_s included. Linear models also accept a rule, and None, which keeps 99.9 % of the
             energy as the paper does.
         inner: inner product of the snapshots, see :func:`softgrasp.reduction.bases.registry.make_basis`; linear only.
@@ -81,12 +85,15 @@ def reduce(
         SolverError: a factorisation failed, or a reduced run did not converge.
     """
     model.scene.refuse_contact("a reduced model")
-    model.scene.refuse_frame("a reduced model")
     if not (N is None or isinstance(N, Truncation | Integral)) or isinstance(N, bool):
         raise BasisError(f"N = {shortened(repr(N))} is no dimension; give a whole number, a Truncation or None")
     if not isinstance(runs, Trajectory | FullRun | Sequence):
         raise ReductionError(f"{shortened(repr(runs))} is no run; give what softgrasp.simulate returns, or a list")
     fulls = [as_full(model, run) for run in ([runs] if isinstance(runs, Trajectory | FullRun) else runs)]
+    if model.system.frame is not None:
+        from softgrasp.reduction.turning.projection import reduce_turning
+
+        return reduce_turning(model, fulls, method or "craig_bampton", N, inner, engine)
     if model.system.points is None:
         return reduce_linear(model, fulls, method or "psd_fixed", N, inner, engine)
     from softgrasp.reduction.strain.training import train
@@ -102,9 +109,11 @@ def reduce(
 def replay(rom: ReducedModel, model: Model, run: Trajectory | FullRun, *, allow: bool = ...) -> ReducedTrajectory: ...
 @overload
 def replay(rom: StrainModel, model: Model, run: Trajectory | FullRun, *, allow: bool = ...) -> StrainRun: ...
+@overload
+def replay(rom: TurningModel, model: Model, run: Trajectory | FullRun, *, allow: bool = ...) -> TurningRun: ...
 def replay(
-    rom: ReducedModel | StrainModel, model: Model, run: Trajectory | FullRun, *, allow: bool = False
-) -> ReducedTrajectory | StrainRun:
+    rom: ReducedModel | StrainModel | TurningModel, model: Model, run: Trajectory | FullRun, *, allow: bool = False
+) -> ReducedTrajectory | StrainRun | TurningRun:
     """E x' = A x + B u + F g by the midpoint rule [HLW06], under the hand of a full run. Collective.
 
     The hand moves as it did where the basis keeps it apart (fixed solid modes), else it feels the force that gave its
@@ -135,6 +144,10 @@ def replay(
     """
     if isinstance(rom, ReducedModel):
         return replay_linear(rom, model, run, allow_unstable=allow)
+    if isinstance(rom, TurningModel):
+        from softgrasp.reduction.turning.projection import replay_turning
+
+        return replay_turning(rom, as_full(model, run), model)
     from softgrasp.reduction.strain.training import replay_strain
 
     return replay_strain(rom, as_full(model, run), model, outside=allow)
@@ -146,8 +159,13 @@ def errors(
 ) -> ModelErrors: ...
 @overload
 def errors(rom: StrainModel, reduced_run: StrainRun, model: Model, run: Trajectory | FullRun) -> StrainErrors: ...
+@overload
+def errors(rom: TurningModel, reduced_run: TurningRun, model: Model, run: Trajectory | FullRun) -> StrainErrors: ...
 def errors(
-    rom: ReducedModel | StrainModel, reduced_run: ReducedTrajectory, model: Model, run: Trajectory | FullRun
+    rom: ReducedModel | StrainModel | TurningModel,
+    reduced_run: ReducedTrajectory,
+    model: Model,
+    run: Trajectory | FullRun,
 ) -> ModelErrors | StrainErrors:
     """|X - X_r| / |X| over the snapshots X of a full run [SBRH21]: states, deformation, energy. Collective.
 
@@ -171,6 +189,11 @@ def errors(
     full = as_full(model, run)
     if isinstance(rom, ReducedModel):
         return errors_linear(rom, reduced_run, full)
+    if isinstance(rom, TurningModel):
+        from softgrasp.reduction.turning.projection import errors_turning
+
+        assert isinstance(reduced_run, TurningRun)
+        return errors_turning(rom, reduced_run, full)
     from softgrasp.reduction.strain.training import errors_strain
 
     return errors_strain(rom, reduced_run, full)

@@ -72,7 +72,10 @@ def _model(path: Path, console: Console, c: Path | None, fmu: Path | None, tick:
     """Files of the C code and the FMU of a model. Raises SceneError: it is of finite strain."""
     model = load(path)
     if not isinstance(model, ReducedModel):
-        raise SceneError(f"{path}: only linear reduced models are exported; this one is of finite strain")
+        raise SceneError(
+            f"{path}: only linear reduced models are exported, of small angles and small strain; this one is a "
+            f"{type(model).__name__}"
+        )
     files = [] if c is None else write_c(model, c, tick)
     files += [] if fmu is None else [write_fmu(model, fmu, tick)]
     console.print(f"{path.name}: {model.name}, N = {model.N}, a tick of {tick:g} s", soft_wrap=True, markup=False)

@@ -11,10 +11,11 @@ import numpy as np
 
 from softgrasp.fem.errors import SceneError, SolverError
 from softgrasp.fem.frame.balance import HandBalance, HandPlace, no_travel, still
-from softgrasp.fem.frame.integrals import Sums, in_space
-from softgrasp.fem.frame.rotation import Pose, cayley_vector, cross_matrix, freedoms, left_jacobian, spatial
+from softgrasp.fem.frame.integrals import in_space
+from softgrasp.fem.frame.path import LARGEST_TURN, PathSteps, mean_wrench, world_outputs
+from softgrasp.fem.frame.rotation import cross_matrix, freedoms, left_jacobian, spatial
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.frame.midpoint import LARGEST_TURN, FreeTurn, GivenTurn, TurningStep
+from softgrasp.fem.run.frame.midpoint import FreeTurn, GivenTurn, TurningStep
 from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import Force, force_values, motion_table
 from softgrasp.fem.system import BlockSystem
@@ -72,41 +73,15 @@ class TurningDrive(ABC):
             linear: C_s q_s, the former for small rotations, (steps + 1, p).
             z: displacement against the hand, in its axes, (steps + 1, p).
         """
-        d, at = self.system.layout.dimension, 0
-        pose, rigid, y = Pose.of(self.q, d), linear.copy(), linear.copy()
-        for output in outputs:
-            part = slice(at, at + output.size)
-            at += output.size
-            if output.size == d:  # the hand itself has more
-                rigid[:, part] = pose.rigid(linear[:, None, part])[:, 0]
-                y[:, part] = rigid[:, part] + pose.turned(z[:, None, part])[:, 0]
-        return rigid, y
+        sizes = [output.size for output in outputs]
+        return world_outputs(sizes, self.system.layout.dimension, self.q, linear, z)
 
     def wrench(self, rows: Array) -> Array:
-        """Mean force and torque about the reference point, in the axes of space, that each step takes, (steps, n_s).
-
-        From the momenta of hand and tissue: f = (QP)' - weight, torque = (QL)' + p' x QP - torque of the weight.
-
-        Args:
-            rows: numbers of :class:`softgrasp.fem.frame.integrals.Sums` at the steps, over all ranks, (steps + 1, m).
-        """
-        system, n_s = self.system, self.q.shape[1]
-        M, rigid = in_space(system.M_hand + system.M_rigid), in_space(system.M_rigid)
-        weight = in_space(system.M_hand)[:3, :3] @ self.g if system.hand_weight else np.zeros(3)
-        momenta, levers, speeds = (np.zeros((len(rows), k)) for k in (6, 3, 3))
-        for n, row in enumerate(rows):
-            hand, sums = self.place(n), Sums.of(row, n_s)
-            momenta[n] = (hand.Q @ sums.momenta(M, hand.xi).reshape(2, 3).T).T.ravel()
-            fall = hand.Q.T @ self.g
-            levers[n] = hand.Q @ (rigid[3:, :3] @ fall + np.cross(sums.first, fall))
-            speeds[n] = hand.v[:3]
-        rate, mean, p, lever = (
-            np.diff(momenta, axis=0) / self.dt,
-            *((x[1:] + x[:-1]) / 2 for x in (momenta, speeds, levers)),
-        )
-        force = rate[:, :3] - rigid[:3, :3] @ self.g - weight
-        torque = rate[:, 3:] + np.cross(p, mean[:, :3]) - lever
-        return np.asarray(np.hstack([force, torque])[:, self.free])
+        """Mean wrench that each step requires, see :func:`softgrasp.fem.frame.path.mean_wrench`, (steps, n_s)."""
+        system = self.system
+        heavy = system.M_hand if system.hand_weight else np.zeros_like(system.M_hand)
+        masses = system.M_hand, system.M_rigid, heavy
+        return mean_wrench(masses, self.g, self.dt, self.q, self.v, rows)
 
 
 class PathDrive(TurningDrive):
@@ -119,35 +94,16 @@ class PathDrive(TurningDrive):
 
     def __init__(self, system: BlockSystem, dt: float, q: Array, v: Array, midpoint: TurningStep) -> None:
         super().__init__(system, dt, q, v)
-        d, steps = system.layout.dimension, len(self.c)
-        self.spins = np.array([self.place(n).xi[3:] for n in range(steps + 1)])
-        self.turns, self.felt, self.squared = (
-            np.zeros((steps, 3)),
-            np.zeros((steps, q.shape[1])),
-            np.zeros((steps, d, d)),
-        )
-        places = [spatial(row) for row in q]
-        poses = [HandPlace.of(x, np.zeros(6)).Q for x in places]
-        for n in range(steps):
-            spin = cayley_vector(poses[n].T @ poses[n + 1]) / dt
-            if not np.linalg.norm(spin) * dt <= LARGEST_TURN:
-                raise SceneError(
-                    f"the hand turns by {np.linalg.norm(spin) * dt:.2g} rad in step {n + 1}, at most {LARGEST_TURN} is "
-                    "possible; use more time.steps"
-                )
-            W = cross_matrix(spin)
-            fall = (np.eye(3) - dt / 2 * W) @ poses[n].T @ (spatial(v[n + 1] - v[n])[:3] / dt - self.g)
-            self.turns[n], self.squared[n] = spin, (W @ W)[:d, :d]
-            self.felt[n] = np.concatenate([fall, (self.spins[n + 1] - self.spins[n]) / dt])[self.free]
-            mean = (poses[n].T @ spatial(v[n])[:3] + poses[n + 1].T @ spatial(v[n + 1])[:3]) / 2
-            self.c[n] = np.concatenate([mean, spin])[self.free]
-        midpoint.spin = self.spins[0]
+        self.steps = PathSteps.of(q, v, dt, self.g, system.layout.dimension)
+        self.c = self.steps.mean
+        midpoint.spin = self.steps.spins[0]
 
     def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
         """One step of the tissue. Collective."""
         assert isinstance(midpoint, TurningStep)
-        midpoint.go(GivenTurn(self.turns[n], midpoint.frame_load(self.felt[n], self.squared[n])))
-        midpoint.spin = self.spins[n + 1]
+        steps = self.steps
+        midpoint.go(GivenTurn(steps.turns[n], midpoint.frame_load(steps.felt[n], steps.squared[n])))
+        midpoint.spin = steps.spins[n + 1]
 
     def check(self, begin: int, end: int) -> None:
         """Nothing to look at: tables are checked when they are read."""

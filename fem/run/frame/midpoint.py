@@ -36,7 +36,6 @@ from softgrasp.fem.run.midpoint import Feedback, TissueState
 from softgrasp.fem.strain.newton import Pairs, Root
 
 LINEAR_TOL = 1e-12  # of a step at small strain, over the largest load: what a factor leaves of a solve
-LARGEST_TURN = 0.5  # of a hand in a step [rad]: the iteration on the rest would be slow above
 
 
 class Turn(ABC):

@@ -1,0 +1,1 @@
+"""Reduced models in the frame of a hand that turns by any angle."""
