@@ -141,8 +141,9 @@ def load(
     True
     """
     with reading(Path(path), layout, scene_hash) as (file, data):
-        readers = {STRAIN: read_strain, TURNING: read_turning}
-        return readers.get(file.attrs["format"], read_linear)(file, data, layout)
+        if file.attrs["format"] == TURNING:
+            return read_turning(file, data, layout)
+        return (read_strain if file.attrs["format"] == STRAIN else read_linear)(file, data, layout)
 
 
 def read_linear(file: h5py.File, data: dict[str, Any], layout: BlockLayout | None) -> ReducedModel:

@@ -49,7 +49,7 @@ class TurningRun(ReducedTrajectory):
     """Reason why the linear law does not serve the run, a sentence; empty where it does."""
 
     @property
-    def energy(self) -> Array:  # type: ignore[override]
+    def energy(self) -> Array:
         """Energy of the tissue [J], (steps + 1,)."""
         return self.stored
 
