@@ -241,6 +241,10 @@ class TissueMidpoint:
     def respond(self) -> Array:
         """Solve S w = h, the step without a load; the owned rows of w. Collective."""
         self.solve_midpoint(np.zeros_like(self.c))
+        return self.owned()
+
+    def owned(self) -> Array:
+        """The owned rows of w, valid until the next call."""
         self._pick()
         return self.x_array
 
@@ -357,10 +361,13 @@ class TissueMidpoint:
         In equilibrium under gravity the load cancels in r, and a two-way step subtracts the hand's part from w: what is
         left is small against the load, not against the rounding in r.
         """
-        load = self._load(self.c)[self.rows]
-        square = total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]
         with self.operators.raise_on_all_ranks():
-            return self.solver.check(self.r, self.w, "the midpoint", float(np.sqrt(square)))
+            return self.solver.check(self.r, self.w, "the midpoint", self.load_size())
+
+    def load_size(self) -> float:
+        """Norm of the load of the step in work [N]. Collective."""
+        load = self._load(self.c)[self.rows]
+        return float(np.sqrt(total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]))
 
     def solve_error(self) -> float:
         """Estimated error of z by solves that end early, energy norm, over the largest z [1]; 0 with a factor."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -150,6 +150,17 @@ def driven_table(M_hand: Array, force: Array, dt: float, q0: Array, v0: Array) -
 
 Force = Callable[[int, float, Array, Array], Array]
 """u = force(step, t_mid [s], q_s, v_s) [N, N m], hand state at the start of the step."""
+
+
+class Driven(Protocol):
+    """Histories of a hand that contact corrects, one step at a time."""
+
+    q: Array
+    """Displacement, (steps + 1, n_s) [m, rad]."""
+    v: Array
+    """Velocity, (steps + 1, n_s)."""
+    c: Array
+    """Coefficients of the load G c of each step, (steps, n_s)."""
 
 
 class TableDrive:

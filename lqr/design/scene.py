@@ -38,10 +38,10 @@ def weight(value: float | list[list[float]], size: int, key: str) -> Array:
 def problem(model: Model) -> RiccatiProblem:
     """Outputs y = C_s q_s + C_z' z and weights Q, R of the scene's ``[control]`` table.
 
-    Without that table: the free node farthest from the hand, Q = R = 1. Collective.
+    Without that table: the free node farthest from the hand, Q = R = 1. Obstacles are no part of the plant. Collective.
 
     Raises:
-        SceneError: an output lies outside the body, Q or R has the wrong size, or effects.obstacles is on.
+        SceneError: an output lies outside the body, or Q or R has the wrong size.
 
     >>> import softgrasp as sg
     >>> problem = sg.problem(sg.build("paper_lqr", ["tissue.cells=[2, 4]"]))
@@ -49,7 +49,6 @@ def problem(model: Model) -> RiccatiProblem:
     ('tip_x', 'tip_y')
     """
     model = checked_model(model)
-    model.scene.refuse_contact("control")
     model.scene.refuse_frame("control")
     scene, system = model.scene, model.system
     outputs = make_outputs(scene, system)

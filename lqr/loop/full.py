@@ -24,14 +24,18 @@ from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
 from softgrasp.fem.solve.solvers import Reproducible, SolverUsed, choose_solver
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import accumulated_cost
-from softgrasp.lqr.loop.drive import FiniteDrive, HeldDrive, ImplicitDrive, LoopDrive
+from softgrasp.lqr.loop.drive import FiniteDrive, GainDrive, HeldDrive, ImplicitDrive, LoopDrive
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import Target, hand_target, rest
 
 if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
+    from softgrasp.fem.run.contact.general import Contact
+    from softgrasp.fem.run.contact.record import ContactRecord
     from softgrasp.fem.strain.newton import NewtonFigures
+    from softgrasp.lqr.loop.touching import TouchingDrive
 
 CHUNKS = 50  # segments of a run without frames: progress, and the check that the numbers are finite
 
@@ -48,6 +52,7 @@ class LoopOptions:
     frame: Callable[[Any], None] | None = None
     progress: Callable[[Any], None] | None = None  # observer of ``run.reached`` and ``run.steps``, between segments
     most: float = np.inf  # cost J at which the run stops as divergent
+    touching: bool = False  # whether the tissue meets the obstacles of the loop's scene
 
 
 @dataclass(frozen=True, repr=False)
@@ -90,6 +95,10 @@ class LoopTrajectory(Shown, FullOrderRun):
     """Time of "factor" (with the responses) and "steps" on the slowest rank [s]."""
     newton: NewtonFigures | None = None
     """Convergence of the steps of finite strain; None where the steps are linear."""
+    energy_drift: float = 0.0
+    """Energy at the end that neither loads, contact nor damping explain, over the largest energy or work [1]."""
+    contact: ContactRecord | None = None
+    """Forces and gaps of obstacles; None in a run that meets none."""
 
     def card(self) -> Card:
         """Steps, cost, where the hand ends, saturation."""
@@ -123,6 +132,7 @@ class ClosedLoop:
         solver: cholesky, mumps, cg, stars or auto.
         rtol: relative residual at which cg or stars ends a step [1]; None for 1e-8 with cg, 1e-4 with stars.
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
+        scene: model with the obstacles that the tissue meets in runs with ``touching``; None for none.
 
     Raises:
         ControlError: dt is not a positive number.
@@ -142,13 +152,14 @@ class ClosedLoop:
         solver: str = "auto",
         rtol: float | None = None,
         reproducible: Reproducible = "auto",
+        scene: Model | None = None,
     ) -> None:
         if not (np.isfinite(dt) and dt > 0):
             raise ControlError(f"dt = {dt} s must be a positive number")
-        self.problem, self.dt = problem, dt
+        self.problem, self.dt, self.scene = problem, dt, scene
         name, reason = choose_solver(problem.layout, solver, contrast=problem.system.contrast)
         begin = time.perf_counter()
-        self.midpoint = make_midpoint(problem.system, dt, name, rtol, reproducible)
+        self.midpoint = make_midpoint(problem.system, dt, name, rtol, reproducible, scene is not None)
         self.solver = self.midpoint.solver.used(reason)
         try:
             self.plant = HandStep(problem.system, self.midpoint, responses=True)
@@ -185,10 +196,21 @@ class ClosedLoop:
             target = hand_target(self.problem, np.asarray(target, dtype=np.float64))
         implicit = ImplicitDrive if self.problem.system.points is None else FiniteDrive
         kind = HeldDrive if actuation.ticks(self.dt) else implicit
-        drive = kind(self.plant, gain, target, actuation, steps)
-        run = LoopRun(self, drive, start or rest(self.problem.system), steps, options, target)
-        run.execute()
-        return run.trajectory(actuation)
+        drive: GainDrive = kind(self.plant, gain, target, actuation, steps)
+        start = start or rest(self.problem.system)
+        if not options.touching:
+            run = LoopRun(self, drive, start, steps, options, target)
+            run.execute()
+            return run.trajectory(actuation)
+        from softgrasp.lqr.loop.touching import touching_drive  # only scenes with contact pay for it
+
+        touching = touching_drive(self.scene, drive, steps)
+        try:
+            run = LoopRun(self, touching, touching.settled(start), steps, options, target)
+            run.execute()
+            return run.trajectory(actuation)
+        finally:
+            touching.release()
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
@@ -199,7 +221,13 @@ class LoopRun(Stepped):
     """One closed-loop run in progress: the TS context, with the fields that observers of a forward run read."""
 
     def __init__(
-        self, loop: ClosedLoop, drive: LoopDrive, start: PlantState, steps: int, options: LoopOptions, target: Target
+        self,
+        loop: ClosedLoop,
+        drive: LoopDrive | TouchingDrive,
+        start: PlantState,
+        steps: int,
+        options: LoopOptions,
+        target: Target,
     ) -> None:
         if steps < 1:
             raise ControlError(f"steps = {steps} must be at least 1")
@@ -217,8 +245,12 @@ class LoopRun(Stepped):
         self.residual_first = self.residual_last = 0.0
         self.paid, self.paid_until = 0.0, 0
         self.midpoint.dissipated = 0.0
+        self.contact: Contact | None = getattr(drive, "contact", None)
+        if self.contact is not None:
+            self.contact.start(self.state, drive.q[0])
         self.midpoint.start(self.state)
-        self.ledger = Ledger(self.midpoint, np.zeros((steps, problem.layout.n_s)))  # two microseconds a step
+        # two microseconds a step
+        self.ledger = Ledger(self.midpoint, np.zeros((steps, problem.layout.n_s)), self.contact)
         self.ledger.start(self.state)
         self.record(0)
 
@@ -248,12 +280,15 @@ class LoopRun(Stepped):
                 self.options.frame(self)
             for end in boundaries:
                 while self.reached < end:
+                    before = self.reached
                     goal = min(end, self.store.limit(self.reached))
                     if goal in (1, self.steps):
                         self.residual_last = self.check_step(ts, goal)
                     else:
                         self.advance_to(ts, goal)
                     self.store.flush(self.reached)
+                    if self.contact is not None:
+                        self.contact.check_hand(self.drive, before, self.reached + 1)
                     if goal == 1:
                         self.residual_first = self.residual_last
                 self._check_finite()
@@ -324,5 +359,7 @@ class LoopRun(Stepped):
             residuals=(self.residual_first, self.residual_last),
             solver=self.solver,
             newton=self.midpoint.figures(),
+            energy_drift=self.ledger.drift(self.state, self.steps),
+            contact=None if self.contact is None else self.contact.record(),
             seconds={"factor": self.loop.factor_seconds, "steps": comm.allreduce(self.seconds, MPI.MAX)},
         )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem import Model, SolverError, frame_count, on_root, scene_hash
+from softgrasp.fem import Model, SolverError, farthest, frame_count, on_root, scene_hash
 from softgrasp.lqr import ControlError, Design, PlantState, RiccatiProblem, finite_problem, solve, solve_reduced
 from softgrasp.lqr.design.controller import CertifiedController, NoController, certified_controller
 from softgrasp.lqr.design.duration import LoopPlan, largest_cost
@@ -34,7 +34,15 @@ from softgrasp.lqr.reduced.bases import A_PRIORI, BasisFamily
 from softgrasp.lqr.reduced.retune import Materials, RetunedGain, Retuner, retuned_gain
 from softgrasp.lqr.reduced.riccati import GainCheck, GainReport
 from softgrasp.reduction import grid_of, materials_at, outside
-from softgrasp.study.control.result import ControlStudy, FiniteLoop, GainStudy, LoopRuns, ReducedLoopRun, Retuned
+from softgrasp.study.control.result import (
+    ControlStudy,
+    FiniteLoop,
+    GainStudy,
+    LoopRuns,
+    ReducedLoopRun,
+    Retuned,
+    TouchingLoop,
+)
 from softgrasp.study.pictures import Frames, move_steps
 from softgrasp.study.shell import repeated
 
@@ -112,25 +120,30 @@ def run_finite(design: Design, model: Model, linear: LoopTrajectory, plan: LoopP
 
 
 def run_loops(design: Design, bases: Sequence[BasisGains], plan: LoopPlan, frames: Frames, notify: Notify) -> LoopRuns:
-    """Full plant under the optimal gain with frames, then under the best stable gain of each basis. Collective.
+    """Full plant under the optimal gain, with frames, and under the best stable gain of each basis. Collective.
 
+    Where the scene has contact, the optimal gain runs into its obstacles too, and the frames are of that run.
     Raises SolverError: the loop under the optimal gain diverges.
     """
     problem, scene, law = design.problem, design.model.scene, design.actuation
     others = [] if design.modal else best_gains(bases, problem.layout)
-    total, done = (len(others) + 1) * plan.steps, 0
+    meets = frames.model if frames.model.scene.effects.obstacles else None
+    total, done = (len(others) + 1 + (meets is not None)) * plan.steps, 0
 
     def progress(run: Any) -> None:
         notify(done + run.reached, total)
 
     shown = move_steps(plan.steps, plan.dt, plan.settle, 3 if frames.few else frame_count(scene, problem.layout.n_e))
     frames.chosen = set(shown)
-    loop = ClosedLoop(problem, plan.dt, scene.time.solver, scene.time.rtol, scene.time.reproducible)
+    loop = ClosedLoop(problem, plan.dt, scene.time.solver, scene.time.rtol, scene.time.reproducible, meets)
     options = LoopOptions(progress=progress, most=largest_cost(design, plan))
-    reduced = []
+    reduced, touching = [], None
     try:
         filmed = replace(options, frames=shown, frame=frames)
-        full = loop.run(design.gain, design.target, plan.steps, law, design.start, filmed)
+        full = loop.run(design.gain, design.target, plan.steps, law, design.start, options if meets else filmed)
+        if meets:
+            done += plan.steps
+            touching = _touching(design, full, partial(loop.run, options=replace(filmed, touching=True)))
         for report in others:
             done += plan.steps
             if report.gain is None:
@@ -143,7 +156,20 @@ def run_loops(design: Design, bases: Sequence[BasisGains], plan: LoopPlan, frame
     finally:
         loop.destroy()
     to_come = predicted_cost(problem, design.solution, full.final - design.target.state)
-    return LoopRuns(plan, full, to_come, tuple(reduced), law.bound(problem.layout.n_s))
+    return LoopRuns(plan, full, to_come, tuple(reduced), law.bound(problem.layout.n_s), touching)
+
+
+def _touching(design: Design, full: LoopTrajectory, run: Callable[..., LoopTrajectory]) -> TouchingLoop:
+    """The optimal gain where the tissue meets the obstacles, beside the run without them. Collective.
+
+    Raises SceneError: an obstacle is in the tissue at the start.
+    """
+    try:
+        met = run(design.gain, design.target, len(full.inputs), design.actuation, design.start)
+    except SolverError as error:  # the hand itself meets an obstacle, or the loop diverges
+        return TouchingLoop(None, reason=str(error))
+    distance = float(farthest(met.outputs[-1:], design.target.y, design.problem.columns)[0])
+    return TouchingLoop(met, distance, float(met.cost[-1] / full.cost[-1] - 1))
 
 
 def pole_sets(study: ControlStudy) -> dict[str, np.ndarray]:

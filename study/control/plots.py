@@ -158,6 +158,10 @@ def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Fr
         files += figure_gains(study.bases, out / "errors.png")
     if study.margins is not None:
         files += style.save(bode(study.margins), out / "bode.png")
+    if loops.touching is not None and loops.touching.run is not None and loops.touching.run.contact is not None:
+        from softgrasp.study.pictures.contact import figure_contact  # few scenes have any
+
+        files += figure_contact(full.times, loops.touching.run.contact, out / "contact.png")
     if study.planned is not None:
         from softgrasp.study.control.obstacle.plots import draw_plan
 
@@ -169,7 +173,10 @@ def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Fr
 
 
 def compared(loops: LoopRuns) -> dict[str, tuple[Array, Array]]:
-    """Outputs and inputs under the a-priori gain and under the paper's gain of largest cost."""
+    """Outputs and inputs at the obstacles, else under the a-priori gain and under the paper's gain of largest cost."""
+    if loops.touching is not None:
+        run = loops.touching.run
+        return {} if run is None else {"with obstacles": (run.outputs, run.inputs)}
     ran = [(r, r.run) for r in loops.reduced if r.run is not None]
     own = [x for x in ran if x[0].method == A_PRIORI]
     paper = sorted((x for x in ran if x[0].method != A_PRIORI), key=lambda x: (float(x[1].cost[-1]), x[0].method))
@@ -179,13 +186,16 @@ def compared(loops: LoopRuns) -> dict[str, tuple[Array, Array]]:
 def _move(out: Path, study: ControlStudy, frames: Frames) -> list[Path]:
     from softgrasp.study.pictures.animation import gif_move
 
-    states, times, full = np.stack(frames.states), np.array(frames.times), study.loops.full
+    states, times, touching = np.stack(frames.states), np.array(frames.times), study.loops.touching
+    full = study.loops.full if touching is None or touching.run is None else touching.run
+    tractions = np.stack(frames.tractions) if frames.tractions else None
     table = np.column_stack([full.times, full.q_s])
     target = study.design.target.state.q_s
-    files = [*figure_move(frames.picture, states, times, table, target, out / "move.png")]  # type: ignore[arg-type]
+    files = [*figure_move(frames.picture, states, times, table, target, out / "move.png", tractions)]  # type: ignore[arg-type]
     if not frames.few:
         # nothing moves between the settling time and the end of the run
         keep = slice(None) if len(times) < 3 or times[-1] <= 1.5 * times[-2] else slice(-1)
         part = table[table[:, 0] <= times[keep][-1] + study.loops.plan.dt / 2]
-        files.append(gif_move(frames.picture, states[keep], times[keep], part, target, out / "move.gif"))  # type: ignore[arg-type]
+        pressed = None if tractions is None else tractions[keep]
+        files.append(gif_move(frames.picture, states[keep], times[keep], part, target, out / "move.gif", pressed))  # type: ignore[arg-type]
     return files

@@ -21,7 +21,7 @@ from softgrasp.lqr import (
     running_words,
 )
 from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, gain_change, settled
-from softgrasp.study.forward.result import trajectory_header
+from softgrasp.study.control.touching import TOUCHING_CAPTIONS, touching_sections, touching_sentence, trajectory_table
 from softgrasp.study.pictures import speed_up
 from softgrasp.study.report import Columns, Page, Section, Share, Table, captioned, entry, percent, table_of
 from softgrasp.study.report.equation import control_equation
@@ -184,6 +184,7 @@ def summary(study: GainStudy) -> list[str]:
             f"reaches the target, within 1 % of the way, in {arrived:.3g} s"
         )  # fmt: skip
         free = "" if study.planned is None else " without obstacles and limits"
+        free = free if study.loops.touching is None else " without obstacles"
         first = f"The optimal gain{free} {reaches}. {solved}".rstrip()
         cost = f"The move{free} costs {paid:.4g}; the Riccati equation predicts {optimal:.4g}."
         if full.saturated:
@@ -263,13 +264,10 @@ def loop_table(study: ControlStudy) -> Table:
 
 def csv_tables(study: ControlStudy) -> dict[str, Table]:
     """CSV file name -> table; the first has hand, outputs, load and cost at every instant under the optimal gain."""
-    full, d = study.loops.full, study.design.problem.layout.dimension
-    n_s = full.q_s.shape[1]
-    names = trajectory_header(n_s, d, full.columns, velocity=False)
-    names += [*(f"{u.label} [{u.load_unit}]" for u in hand_columns(n_s, d, "u")), "cost"]
-    inputs = np.vstack([full.inputs, full.inputs[-1:]])
-    data = np.column_stack([full.times, full.q_s, full.outputs, inputs, full.cost])
-    files = {"trajectory.csv": Table(tuple(names), data.tolist())}
+    d, touching = study.design.problem.layout.dimension, study.loops.touching
+    files = {"trajectory.csv": trajectory_table(study.loops.full, d)}
+    if touching is not None and touching.run is not None:
+        files["contact.csv"] = trajectory_table(touching.run, d)
     if study.planned is not None:
         from softgrasp.study.control.obstacle.report import plan_table
 
@@ -292,6 +290,8 @@ def compose(study: GainStudy, seconds: Mapping[str, float], pictures: Sequence[P
             f"{name}: optimal gain", summary(study), [*noted, *_observed(study), result], {}, files, " --gain-only"
         )
     parts, outcome = sections(study, noted, result, pictures), summary(study)
+    if study.loops.touching is not None:
+        outcome = [touching_sentence(study, study.loops.touching), *outcome]
     if study.planned is not None:
         from softgrasp.study.control.obstacle.report import sentence
 
@@ -303,7 +303,8 @@ def sections(study: ControlStudy, notes: Sequence[Section], result: Section, dra
     """Parts of the page of the loops."""
     faster = speed_up(np.array([0.0, study.loops.plan.settle]))
     speed = "" if faster == 1 else f" at {faster:g} times its speed"
-    figures = {file.name: (file, text.format(speed=speed)) for file, text in captioned(drawn, CAPTIONS)}
+    captions = CAPTIONS if study.loops.touching is None else CAPTIONS | TOUCHING_CAPTIONS
+    figures = {file.name: (file, text.format(speed=speed)) for file, text in captioned(drawn, captions)}
 
     def pick(*names: str) -> list[tuple[Path, str]]:
         return [figures[name] for name in names if name in figures]
@@ -318,6 +319,7 @@ def sections(study: ControlStudy, notes: Sequence[Section], result: Section, dra
         *notes,
         *planned,
         *_observed(study),
+        *touching_sections(study, pick("contact.png")),
         replace(result, figures=pick("histories.png", "decay.png")),
         Section("Equation", equation=control_equation(study.design.model.scene)),
     ]

@@ -14,7 +14,7 @@ from softgrasp.lqr import BasisGains, CertifiedController, GainQuality, LoopPlan
 from softgrasp.lqr.design.feedback import Design, running_words
 from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
 from softgrasp.lqr.plant.problem import RiccatiSolution, rigid_gains, translation_defect, velocity_defect
-from softgrasp.study.forward.result import newton_keys
+from softgrasp.study.forward.result import contact_keys, newton_keys
 from softgrasp.study.report.origin import origin, peak_memory_mb
 
 if TYPE_CHECKING:  # plans and observers are not imported where a scene has none
@@ -67,6 +67,7 @@ class LoopRuns:
     to_come: float  # cost still to come at the end, from the Riccati solution
     reduced: tuple[ReducedLoopRun, ...]  # under the best stable gain of each basis
     limits: Array | None = None  # of the inputs [N, N m], inf for none; None without any
+    touching: TouchingLoop | None = None  # the loop that meets the obstacles; None where the effect is off
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,36 @@ class FiniteLoop:
             return f"the linear gain does not stabilise it: {self.reason}"
         past = f"overshoot {self.overshoot:.3g} instead of {self.overshoot_linear:.3g}"
         return f"the cost changes by {self.cost_excess:+.2g} of the linear prediction, {past}"
+
+
+@dataclass(frozen=True)
+class TouchingLoop:
+    """The gain on the plant that meets the obstacles."""
+
+    run: LoopTrajectory | None  # None when it failed
+    distance: float = float("nan")  # distance of the farthest output to its target at the end [m]
+    cost_excess: float = float("nan")  # cost over that of the run without obstacles, less one [1]
+    reason: str = ""  # why the run failed; else empty
+
+    def result(self) -> dict[str, Any]:
+        """The key "contact" of ``result.json``."""
+        run = self.run
+        if run is None or run.contact is None:
+            return {"reason": self.reason}
+        return {
+            **contact_keys(run.contact),
+            "hand_final": run.q_s[-1].tolist(),
+            "input_final": run.inputs[-1].tolist(),
+            "input_largest": np.abs(run.inputs).max(axis=0).tolist(),
+            "output_final": run.outputs[-1].tolist(),
+            "distance_final": self.distance,
+            "cost": float(run.cost[-1]),
+            "cost_excess": self.cost_excess,
+            "energy_drift": run.energy_drift,
+            "saturated": run.saturated,
+            "time": dict(run.seconds),
+            "reason": "",
+        }
 
 
 @dataclass(frozen=True)
@@ -179,6 +210,7 @@ class ControlStudy(GainStudy):
             "loop": _loop(self),
             **({} if self.finite is None else {"finite_strain": _finite(self.finite)}),
             **({} if self.planned is None else {"obstacle": self.planned.result()}),
+            **({} if self.loops.touching is None else {"contact": self.loops.touching.result()}),
         }
 
 

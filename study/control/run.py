@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TaskProgressColumn
 
-from softgrasp.fem import Loop, Model, Stopwatch, remove_own, scene_hash, sharing_factors
+from softgrasp.fem import Loop, Model, Scene, SceneError, Stopwatch, remove_own, scene_hash, sharing_factors
 from softgrasp.lqr import A_PRIORI, Design, PlantState, control_of, finite_problem, linearised, with_control
 from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import design
@@ -25,6 +25,10 @@ from softgrasp.study.shell import Flags, Session, folder_lock
 if TYPE_CHECKING:  # observers are not imported where a scene has none
     from softgrasp.study.control.observer.result import ObservedStudy
 
+WITHOUT_CONTACT = (
+    "Gains, bounds and margins are those of the plant without obstacles: no certificate covers contact, and "
+    "feedback that works without obstacles may fail at one."
+)
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 
 
@@ -48,7 +52,7 @@ def run_control(
     """
     session = Session("control", path, overrides, out, console, **flags)
     scene = session.scene()
-    scene.refuse_contact("control")
+    refuse_touching(scene)
     scene.refuse_frame("control")
     model, sentence = with_control(session.model(scene, steps=False))
     if sentence:
@@ -107,13 +111,26 @@ def run_control(
     return result
 
 
+def refuse_touching(scene: Scene) -> None:
+    """Refuse contact beside what cannot go with it. Raises SceneError."""
+    if not scene.effects.obstacles:
+        return
+    other = "effects.finite_strain" if scene.effects.finite_strain is not None else ""
+    if scene.control is not None and scene.control.constraints is not None:
+        other = "control.constraints"  # which keeps the body clear of obstacles
+    if other:
+        raise SceneError(
+            f"scene '{scene.name}': control cannot go with effects.obstacles and {other} yet; set one of them to false"
+        )
+
+
 def small_study(feedback: Design, watch: Stopwatch, note: str) -> GainStudy:
     """The a-priori gains and the small controller, without closed loop. Collective."""
     bases: tuple[BasisGains, ...] = ()
     if not feedback.modal:
         with watch.stage("reduced"):
             bases = reduce_gains(feedback, orders(feedback)[0], names=(A_PRIORI,), offered_only=True)
-    return measure.gain_study(feedback, bases, note)
+    return measure.gain_study(feedback, bases, note, WITHOUT_CONTACT if feedback.model.scene.effects.obstacles else "")
 
 
 def end_state(model: Model, study: GainStudy) -> PlantState:
@@ -157,7 +174,8 @@ def loop_study(
             bases = bases_with_bounds(feedback, bases, duration, counted(bar, "duality gaps"))
     small = measure.gain_study(feedback, bases, note, reason)
     lost = f"the loop from tick to tick is not certified: {sampled.reason}" if sampled and sampled.reason else ""
-    notes = (*small.notes, *filter(None, (lost, unused_rate(model), duration.note)))
+    free = WITHOUT_CONTACT if model.scene.effects.obstacles else ""
+    notes = (*small.notes, *filter(None, (lost, unused_rate(model), duration.note, free)))
     frames = Frames(model, session.out, session.pictures)
     with watch.stage("loop"):
         loops = measure.run_loops(feedback, bases, duration, frames, counted(bar, "closed loop"))

@@ -156,12 +156,9 @@ class Simulation:
         header += ["energy [J]", "dissipated [J]"]
         parts = [run.times, run.q_s, run.v_s, run.outputs, np.vstack([np.full(n_s, np.nan), run.force])]
         parts += [run.energy, run.dissipated]
-        if (contact := run.contact) is not None:
-            for o, name in enumerate(contact.names):
-                axes = "xyz"[: self.dimension]
-                header += [f"{name}_force_{axis} [N]" for axis in axes] + [f"{name}_gap [m]", f"{name}_touching [1]"]
-                steps = np.column_stack([contact.force[:, o], contact.gap[1:, o], contact.touching[:, o]])
-                parts.append(np.vstack([[*[np.nan] * self.dimension, contact.gap[0, o], 0.0], steps]))
+        if run.contact is not None:
+            more, values = contact_columns(run.contact)
+            header, parts = header + more, [*parts, values]
         return Table(tuple(header), np.column_stack(parts).tolist())
 
 
@@ -190,6 +187,16 @@ def contact_keys(contact: ContactRecord) -> dict[str, Any]:
             for o, name in enumerate(contact.names)
         },
     }
+
+
+def contact_columns(contact: ContactRecord) -> tuple[list[str], Any]:
+    """Header, and force, gap and touching nodes of each obstacle at each time, (times, columns); no force at first."""
+    header, parts, d = [], [], contact.force.shape[2]
+    for o, name in enumerate(contact.names):
+        header += [f"{name}_force_{axis} [N]" for axis in "xyz"[:d]] + [f"{name}_gap [m]", f"{name}_touching [1]"]
+        steps = np.column_stack([contact.force[:, o], contact.gap[1:, o], contact.touching[:, o]])
+        parts.append(np.vstack([[*[np.nan] * d, contact.gap[0, o], 0.0], steps]))
+    return header, np.hstack(parts)
 
 
 def contact_rows(contact: ContactRecord) -> list[tuple[str, str]]:

@@ -18,7 +18,7 @@ from softgrasp.fem.run.contact.rows import Rows
 from softgrasp.fem.run.contact.touching import Touching
 from softgrasp.fem.run.finite_strain import FiniteStrainMidpoint
 from softgrasp.fem.run.midpoint import Feedback
-from softgrasp.fem.run.motion import ForceDrive, TableDrive
+from softgrasp.fem.run.motion import Driven
 
 BALANCED = 8  # rounds that move w to w'R = 0; near rest, where w'R is no work to speak of, this would not end
 CLOSE = 1e-13  # of the body: gaps of pressed nodes at the end of the rounds [1]
@@ -118,7 +118,7 @@ class FiniteContact(Contact):
 
     factors = 0  # tangents factored when the responses were made
 
-    def _add(self, n: int, f: Array, drive: TableDrive | ForceDrive) -> None:
+    def _add(self, n: int, f: Array, drive: Driven) -> None:
         """See :meth:`Contact._add`; the step has the forces already. Collective."""
         self.forces = self.responses.forces(f)
         self.moved = self._take(self.midpoint.w_array)

@@ -20,7 +20,7 @@ from softgrasp.fem.run.contact.general import MOST, ROUNDING, STILL, Contact, un
 from softgrasp.fem.run.contact.rows import Ints, Rows
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
-from softgrasp.fem.run.motion import ForceDrive, TableDrive
+from softgrasp.fem.run.motion import Driven
 
 KINDS = {np.dtype(float): "double[]", np.dtype(np.intc): "int[]", np.dtype(bool): "char[]"}
 """Types in C."""
@@ -100,7 +100,7 @@ class FlatContact(Contact):
         self.tol = ROUNDING * (float(self.c.softgrasp_look(self.f)) + self.layout.extent)
         return self.tol
 
-    def press(self, n: int, drive: TableDrive | ForceDrive) -> None:
+    def press(self, n: int, drive: Driven) -> None:
         """See :meth:`Contact.press`. Collective."""
         self.n, self.drive, self.q0[:] = n, drive, drive.q[n]
         self._place(n + 1)
@@ -112,7 +112,7 @@ class FlatContact(Contact):
         self._settle_flat(n, tol, drive)
         self.c.softgrasp_account(self.f, n)
 
-    def _settle_flat(self, n: int, tol: float, drive: TableDrive | ForceDrive) -> None:
+    def _settle_flat(self, n: int, tol: float, drive: Driven) -> None:
         """Forces of the step, by rounds in which rows enter. Collective."""
         c, f, responses = self.c, self.f, self.responses
         if c.softgrasp_missing(f, 0.0, self.reached):

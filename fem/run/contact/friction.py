@@ -27,7 +27,7 @@ from softgrasp.fem.run.contact.general import Contact
 from softgrasp.fem.run.contact.rows import Flags, Ints, Rows
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
-from softgrasp.fem.run.motion import ForceDrive, TableDrive
+from softgrasp.fem.run.motion import Driven
 
 
 def tangents(normal: Array) -> Array:
@@ -109,7 +109,7 @@ class FrictionContact(Contact):
             np.full(k, OPEN, np.intc), np.zeros((k, self.d)),
         )  # fmt: skip
 
-    def press(self, n: int, drive: TableDrive | ForceDrive) -> None:
+    def press(self, n: int, drive: Driven) -> None:
         """See :meth:`Contact.press`. Collective."""
         super().press(n, drive)
         self.table.energy[3] -= np.einsum("ka,ka->", self.rows.x_t, self.rows.slip)

@@ -35,7 +35,7 @@ from softgrasp.fem.run.contact.rows import Flags, Ints, Rows
 from softgrasp.fem.run.contact.strike import Strike
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
-from softgrasp.fem.run.motion import ForceDrive, TableDrive
+from softgrasp.fem.run.motion import Driven
 
 ROUNDING = 64 * float(np.finfo(float).eps)  # of a gap, over the coordinates it is computed from [1]
 STILL = 1e-12  # normal velocity of pressed nodes over the largest velocity on the boundary, which is rounding [1]
@@ -82,7 +82,7 @@ class Contact:
         self.z, self.moved, self.forces = (np.zeros(self.p * self.d) for _ in range(3))
         self.gaps = self.after = np.zeros((len(self.obstacles), self.p))
         self.fastest = 0.0  # largest velocity of a boundary node in a step with contact [m/s]
-        self.drive: TableDrive | ForceDrive | None = None
+        self.drive: Driven | None = None
         self.n = 0  # number of the step in work
         self.responses = self._make_responses()
         self.strike = Strike(system, self.surface, midpoint, self.table, hand is not None)
@@ -146,7 +146,7 @@ class Contact:
                 f"{-self.gaps[o, i]:.3g} m deep; move it, or start elsewhere"
             )
 
-    def press(self, n: int, drive: TableDrive | ForceDrive) -> None:
+    def press(self, n: int, drive: Driven) -> None:
         """Turn the step without contact in the midpoint into one that leaves no penetration. Collective.
 
         Raises SolverError: the rounds of the step do not end, or the step could carry a node through an obstacle.
@@ -241,7 +241,7 @@ class Contact:
             C[row, [responses.where[key] for key in several]] = shares
         return C
 
-    def _add(self, n: int, f: Array, drive: TableDrive | ForceDrive) -> None:
+    def _add(self, n: int, f: Array, drive: Driven) -> None:
         """Take forces f into the step of tissue and hand. Collective."""
         midpoint = self.midpoint
         w, r = midpoint.w.array_w, midpoint.r.array_w  # PETSc sees that they change
@@ -251,7 +251,7 @@ class Contact:
         self._push_hand(n, f, drive)
         self.moved = self._take(midpoint.w_array)
 
-    def _push_hand(self, n: int, f: Array, drive: TableDrive | ForceDrive) -> None:
+    def _push_hand(self, n: int, f: Array, drive: Driven) -> None:
         """Let a two-way hand feel forces f that the step has taken in."""
         if self.hand is None:
             return
@@ -312,7 +312,7 @@ class Contact:
         forces = self.forces if len(self.rows.node) else np.zeros_like(self.forces)
         return forces.reshape(self.p, self.d)
 
-    def check_hand(self, drive: TableDrive | ForceDrive, begin: int, end: int) -> None:
+    def check_hand(self, drive: Driven, begin: int, end: int) -> None:
         """See that the nodes that follow the hand are in no obstacle at the steps from begin to before end.
 
         Raises SolverError: they did; the message names obstacle and time.

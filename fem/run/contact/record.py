@@ -30,7 +30,7 @@ class ContactRecord:
     touch: float
     """Energy dissipated in the steps of first touch, >= 0 [J]."""
     stopped: float
-    """Kinetic energy dissipated by the impulses [J]; >= 0 without friction, with it their sum is."""
+    """Kinetic energy dissipated by impulses along normals [J]; with ``rubbed`` it adds up to >= 0."""
     rubbed: float
     """Energy dissipated by friction, >= 0 [J]."""
     rounds: int

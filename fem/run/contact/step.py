@@ -7,6 +7,7 @@ from softgrasp.fem.obstacles.compiled import contact_library
 from softgrasp.fem.run.contact.flat import FlatContact
 from softgrasp.fem.run.contact.general import Contact
 from softgrasp.fem.run.contact.touching import Touching
+from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import ForceDrive, TableDrive
 
@@ -41,15 +42,26 @@ def make_contact(
 
     Raises SoftgraspError: a path of an obstacle does not fit, or the prescribed hand itself meets an obstacle.
     """
-    assert isinstance(midpoint, Touching)
     hand = drive.step if isinstance(drive, ForceDrive) and model.system.two_way else None
+    contact = begin_contact(model, midpoint, steps, hand)
+    if isinstance(drive, TableDrive):
+        contact.check_hand(drive, 0, steps + 1)
+    return ContactDrive(drive, contact), contact
+
+
+def begin_contact(model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> Contact:
+    """The contact that acts on the steps of a midpoint from now on; ``hand``: see `Contact`. Collective.
+
+    Raises SceneError: a path of an obstacle does not fit.
+    """
+    assert isinstance(midpoint, Touching)
     obstacles = model.scene.obstacle or []
     kind: type[Contact] = Contact
     if model.system.points is not None:
         from softgrasp.fem.run.contact.finite import FiniteContact  # only scenes with finite strain pay for it
 
         midpoint.contact = FiniteContact(model, midpoint, steps, hand)
-        return _checked(drive, midpoint.contact, steps)
+        return midpoint.contact
     flat = {entry.kind for entry in obstacles} == {"halfspace"} and contact_library() is not None
     if any(entry.friction for entry in obstacles):
         from softgrasp.fem.run.contact import friction  # only scenes with friction pay for it
@@ -58,11 +70,4 @@ def make_contact(
     elif flat:
         kind = FlatContact
     midpoint.contact = kind(model, midpoint, steps, hand)
-    return _checked(drive, midpoint.contact, steps)
-
-
-def _checked(drive: TableDrive | ForceDrive, contact: Contact, steps: int) -> tuple[ContactDrive, Contact]:
-    """Drive and contact; the prescribed hand meets no obstacle. Raises SolverError: it does."""
-    if isinstance(drive, TableDrive):
-        contact.check_hand(drive, 0, steps + 1)
-    return ContactDrive(drive, contact), contact
+    return midpoint.contact

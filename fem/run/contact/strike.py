@@ -10,10 +10,8 @@ from softgrasp.fem.run.contact.impulse import Impulses
 from softgrasp.fem.run.contact.record import Tables
 from softgrasp.fem.run.contact.rows import Ints
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
-from softgrasp.fem.run.motion import ForceDrive, TableDrive
+from softgrasp.fem.run.motion import Driven
 from softgrasp.fem.system import BlockSystem
-
-Drive = TableDrive | ForceDrive
 
 
 class Strike:
@@ -49,7 +47,7 @@ class Strike:
             self.reactions().mass.enter(nodes)
 
     def stop(
-        self, state: TissueState, drive: Drive, n: int, obstacle: Ints, node: Ints, normal: Array, b: Array
+        self, state: TissueState, drive: Driven, n: int, obstacle: Ints, node: Ints, normal: Array, b: Array
     ) -> None:
         """Change the velocity of nodes (k,) along normals (k, d) by b (k,) at the end of step n. Collective."""
         y = self.reactions().stop(node, normal, b)
@@ -57,7 +55,7 @@ class Strike:
         self.strike(state, drive, n, obstacle, node, normal, y)
 
     def strike(
-        self, state: TissueState, drive: Drive, n: int, obstacle: Ints, node: Ints, along: Array, y: Array
+        self, state: TissueState, drive: Driven, n: int, obstacle: Ints, node: Ints, along: Array, y: Array
     ) -> None:
         """Impulses y (k,) of obstacles on nodes along vectors (k, d) at the end of step n. Collective."""
         table, surface, dt, each = self.table, self.surface, self.midpoint.dt, y[:, None] * along
@@ -68,7 +66,7 @@ class Strike:
         table.hand[n - 1] += surface.T.T @ forces.ravel() / dt
         self._kick(state, drive, n, *self.reactions().jump(node, along, y))
 
-    def _kick(self, state: TissueState, drive: Drive, n: int, jump: Array, hand: Array, gained: Array) -> None:
+    def _kick(self, state: TissueState, drive: Driven, n: int, jump: Array, hand: Array, gained: Array) -> None:
         """Add a jump of the velocity to tissue and hand, and what the momentum gains. Collective."""
         G, midpoint, table = self.system.G, self.midpoint, self.table
         mean = state.v.array_r + jump / 2

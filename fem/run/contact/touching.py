@@ -10,17 +10,24 @@ from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 
 
 class Touching(TissueMidpoint):
-    """What a step with contact does at its end; ``contact`` is set before the start."""
+    """What a step with contact does at its end; ``contact`` is set before the start, and None lets nothing touch."""
 
-    contact: Contact
+    contact: Contact | None = None
 
     def advance(self, old: TissueState, new: TissueState) -> None:
         """Write the new state, carry k and r on, and stop what is pressed. Collective."""
         super().advance(old, new)
-        self.contact.finish(new)
+        if self.contact is not None:
+            self.contact.finish(new)
+
+    def load_size(self) -> float:
+        """See :meth:`TissueMidpoint.load_size`: with the forces of obstacles, which may balance. Collective."""
+        pressing = 0.0 if self.contact is None else float(np.linalg.norm(self.contact.pressing()))
+        return super().load_size() + pressing
 
     def restart_arrays(self) -> dict[str, Array]:
         """Further arrays of a restart file: those of the step, then record and sets of the contact."""
+        assert self.contact is not None
         step, contact = super().restart_arrays(), self.contact.restart_arrays()
         table, own = contact["solver_rows"], step.get("solver_numbers", np.zeros(0))
         head = np.array([len(own), *table.shape], dtype=float)
@@ -30,6 +37,7 @@ class Touching(TissueMidpoint):
         """Continue with what `restart_arrays` returned, after `adopt`. Collective."""
         if numbers is None:
             return
+        assert self.contact is not None
         count, *shape = (int(x) for x in numbers[:3])
         own, table, sets = np.split(numbers[3:], np.cumsum([count, shape[0] * shape[1]]))
         super().restore(rows, own)
@@ -37,5 +45,6 @@ class Touching(TissueMidpoint):
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
-        self.contact.destroy()
+        if self.contact is not None:
+            self.contact.destroy()
         super().destroy()

@@ -18,7 +18,6 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.fields.picture import gather_picture
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.lqr.design.scene import problem
 from softgrasp.reduction.reduce import reduce
 from softgrasp.study.forward.cautions import small_obstacles
 from softgrasp.study.forward.explain import explain_model
@@ -49,10 +48,8 @@ def test_forces_gaps_and_touching_nodes_are_in_the_files(tmp_path: Path) -> None
     assert np.allclose(table[:, names.index("table_gap [m]")], contact.gap[:, 0], rtol=1e-9, atol=1e-15)
 
 
-def test_reduction_and_control_refuse_contact() -> None:
+def test_reduction_refuses_contact() -> None:
     model = build("paper_forward", SCENE)
-    with pytest.raises(SceneError, match=r"control cannot go with effects.obstacles yet"):
-        problem(model)
     with pytest.raises(SceneError, match=r"a reduced model cannot go with effects.obstacles yet"):
         reduce(model, simulate(model))
 
