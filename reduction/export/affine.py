@@ -2,9 +2,10 @@
 
     A(theta) = A_0 + sum_l mu_l A_mu,l + lambda_l A_lambda,l [+ beta_l (mu_l A_beta_mu,l + lambda_l A_beta_lambda,l)]
 
-with the viscous parts in E instead for damped canonical models. Each coordinate has an energy of about w_i^2 / 2 with
-the material of the projection: d are powers of two, so that no digit changes. All rows are multiplied by E^-1, so that
-E = I where it does not depend on the material.
+with the viscous parts in E instead for damped canonical models. A row of an own parameter stands as a layer with mu its
+value and lambda = 0, one of own damping with beta = 1 and A_mu = 0; own masses and loads are in A_0, E_0 and f. Each
+coordinate has an energy of about w_i^2 / 2 with the material of the projection: d are powers of two, so that no digit
+changes. All rows are multiplied by E^-1, so that E = I where it does not depend on the material.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem.columns import hand_of
+from softgrasp.fem.material import REST, LayerMaterial
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.system import EnergySystem, ModelError, UnstableModelError
@@ -49,6 +51,7 @@ class AffinePlant:
     d: Array  # energy coordinates, x = d w, (N,)
     inputs: tuple[Label, ...]  # one per column of B
     outputs: tuple[Label, ...]  # one per row of C
+    rows: tuple[LayerMaterial, ...]  # materials of the layers, then those of own parameters
 
     @property
     def N(self) -> int:
@@ -61,11 +64,36 @@ class AffinePlant:
         return len(self.theta)
 
     def constants(self) -> tuple[Label, ...]:
-        """mu, lambda, beta of every layer, in the order of theta."""
-        ends = [""] if self.layers == 1 else [f"_{i + 1}" for i in range(self.layers)]
+        """mu, lambda, beta of every layer, then every own parameter by its name, in the order of theta."""
+        names = [m.part for m in self.rows]
+        result = list[Label]()
+        for i, m in enumerate(self.rows):
+            many, number = names.count(m.part) > 1, names[: i + 1].count(m.part)
+            end = f"_{number}" if many else ""
+            keys = ("mu", "lambda", "beta") if not m.part else (m.part, f"lambda_{m.part}", f"beta_{m.part}")
+            units = ("Pa" if not m.part else "", "Pa", "s")
+            result += [Label(f"{key}{end}", unit) for key, unit in zip(keys, units, strict=True)]
+        return tuple(result)
+
+    def tunable(self) -> tuple[bool, ...]:
+        """Whether each of the constants may be changed."""
         return tuple(
-            Label(f"{key}{end}", unit) for end in ends for key, unit in (("mu", "Pa"), ("lambda", "Pa"), ("beta", "s"))
+            able
+            for m in self.rows
+            for able in (
+                m.adds not in FIXED and m.part != REST,
+                not m.part,
+                self.damped and (not m.part or m.adds in ("", "stiffness")),
+            )
         )
+
+
+FIXED = ("mass", "load")  # own terms whose values are those of the export
+
+
+def theta_of(materials: tuple[LayerMaterial, ...]) -> Array:
+    """mu, lambda, beta of every row, (rows, 3)."""
+    return np.array([[m.mu, m.lam, 1.0 if m.adds == "damping" else m.beta] for m in materials])
 
 
 def affine_plant(model: ReducedModel, tick: float) -> AffinePlant:
@@ -103,7 +131,7 @@ def affine_plant(model: ReducedModel, tick: float) -> AffinePlant:
     plant = AffinePlant(
         name=model.name,
         tick=tick,
-        theta=np.array([[m.mu, m.lam, m.beta] for m in model.materials]),
+        theta=theta_of(model.materials),
         damped=model.damped,
         A_0=balanced(rest.A * d),
         A_mu=parts(mu),
@@ -118,10 +146,13 @@ def affine_plant(model: ReducedModel, tick: float) -> AffinePlant:
         d=d,
         inputs=_named(system.inputs),
         outputs=_hand(system) + _named(system.outputs),
+        rows=model.materials,
     )
     names = [label.name for label in (*plant.inputs, *plant.outputs, *plant.constants())]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ModelError(f"two numbers of the exported model are called {twice[0]}; rename the output of the scene")
+        raise ModelError(
+            f"two numbers of the exported model are called {twice[0]}; rename the output or the own parameter"
+        )
     return plant
 
 
@@ -136,7 +167,7 @@ class Term:
 def material_terms(model: ReducedModel) -> tuple[Term, list[Term], list[Term], list[Term], list[Term]]:
     """Terms without stiffness, then of mu, lambda, beta mu, beta lambda of every layer."""
     own = model.parameters(model.materials)
-    empty = tuple(replace(m, mu=0.0, lam=0.0, beta=0.0) for m in model.materials)
+    empty = tuple(m if m.adds in FIXED else replace(m, mu=0.0, lam=0.0, beta=0.0) for m in model.materials)
 
     def at(i: int, **constants: Any) -> Term:
         materials = (*empty[:i], replace(empty[i], **constants), *empty[i + 1 :])
@@ -150,6 +181,12 @@ def material_terms(model: ReducedModel) -> tuple[Term, list[Term], list[Term], l
     mu, lam, beta_mu, beta_lambda = list[Term](), list[Term](), list[Term](), list[Term]()
     for i, m in enumerate(model.materials):
         scale = m.mu or 1.0  # with it the stiffness is not small against the rest
+        if m.adds in (*FIXED, "damping"):
+            nothing = slope(rest, rest, 1.0)
+            for terms in (mu, lam, beta_lambda):
+                terms.append(nothing)
+            beta_mu.append(nothing if m.adds in FIXED else slope(at(i, mu=scale), rest, scale))
+            continue
         for key, stiff, viscous in (("mu", mu, beta_mu), ("lam", lam, beta_lambda)):
             elastic = at(i, **{key: scale})
             stiff.append(slope(elastic, rest, scale))

@@ -129,7 +129,7 @@ def _description(plant: AffinePlant, token: str) -> ET.Element:
 
 
 def _units(root: ET.Element, plant: AffinePlant) -> None:
-    used = {label.unit for label in (*plant.inputs, *plant.outputs, *plant.constants())}
+    used = {label.unit for label in (*plant.inputs, *plant.outputs, *plant.constants()) if label.unit}
     units = ET.SubElement(root, "UnitDefinitions")
     for unit in sorted(used | {"s"}):
         ET.SubElement(ET.SubElement(units, "Unit", name=unit), "BaseUnit", UNITS[unit])
@@ -145,8 +145,8 @@ def _variables(parent: ET.Element, plant: AffinePlant) -> None:
         add(INPUT + i, label, "input", start="0", description="held over a tick")
     for i, label in enumerate(plant.outputs):
         add(OUTPUT + i, label, "output", initial="calculated")
-    for i, (label, value) in enumerate(zip(plant.constants(), plant.theta.ravel(), strict=True)):
-        if plant.damped or not label.name.startswith("beta"):
+    for i, (label, value, able) in enumerate(zip(plant.constants(), plant.theta.ravel(), plant.tunable(), strict=True)):
+        if able:
             add(CONSTANT + i, label, "parameter", variability="tunable", start=repr(float(value)))
     for i, value in enumerate(plant.start):
         state = Label(f"w_{i + 1}", "")

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from softgrasp.fem.material import of_layers
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.reduced import midpoint_map
-from softgrasp.reduction.export.affine import AffinePlant, Label, affine_plant
+from softgrasp.reduction.export.affine import FIXED, AffinePlant, Label, affine_plant, theta_of
 from softgrasp.reduction.export.c import CODE, array, code_of, comment, hexadecimal, write_files
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import Stepper
@@ -59,10 +60,13 @@ def plant_texts(plant: AffinePlant) -> dict[str, str]:
     viscous = plant.E_0 is not None
     numbers = {
         "N": plant.N, "INPUTS": len(plant.inputs), "OUTPUTS": len(plant.outputs), "LAYERS": plant.layers,
+        "MATERIALS": len(of_layers(plant.rows)),
         "THETA": plant.theta.size, "DAMPED": int(plant.damped), "VISCOUS_E": int(viscous), "TICK": plant.tick.hex(),
     }  # fmt: skip
     size = [f"/* {plant.name}, N = {plant.N}, a tick of {plant.tick!r} s"]
     size += [_listed(*pair) for pair in zip(("u", "y", "theta"), _groups(plant), strict=True)]
+    left = [label.name for label, able in zip(plant.constants(), plant.tunable(), strict=True) if not able]
+    size += [f"   leave as they are: {', '.join(left)}"] if left else []
     size += ["*/"] + [f"#define SG_PLANT_{key} {value}" for key, value in numbers.items()]
     arrays: dict[str, Array] = {"A_0": plant.A_0, "A_MU": plant.A_mu, "A_LAMBDA": plant.A_lambda}
     if plant.damped:
@@ -82,7 +86,9 @@ def _groups(plant: AffinePlant) -> tuple[tuple[Label, ...], ...]:
 
 
 def _listed(letter: str, names: tuple[Label, ...]) -> str:
-    return "\n".join(f"   {letter}[{i}]  {label.name} [{label.unit}]" for i, label in enumerate(names))
+    units = (f" [{label.unit}]" if label.unit else ", of your form" for label in names)
+    pairs = enumerate(zip(names, units, strict=True))
+    return "\n".join(f"   {letter}[{i}]  {label.name}{unit}" for i, (label, unit) in pairs)
 
 
 def golden_log(model: ReducedModel, plant: AffinePlant) -> str:
@@ -93,10 +99,13 @@ def golden_log(model: ReducedModel, plant: AffinePlant) -> str:
     u = inertia * np.sin(2 * np.pi * np.outer(t, np.linspace(0.7, 1.9, n_s)))
     stepper = Stepper(model.at(), plant.tick, plant.d * plant.start)
     parts = [("start", _march(stepper, u[:GOLDEN_STEPS]))]
-    other = tuple(replace(m, mu=OTHER[0] * m.mu, lam=OTHER[1] * m.lam, beta=OTHER[2] * m.beta) for m in model.materials)
+    other = tuple(
+        m if m.adds in FIXED else replace(m, mu=OTHER[0] * m.mu, lam=OTHER[1] * m.lam, beta=OTHER[2] * m.beta)
+        for m in model.materials
+    )
     with suppress(UnstableModelError):
         stepper = Stepper(model.at(other), plant.tick, stepper.state)
-        theta = np.array([[m.mu, m.lam, m.beta] for m in other])
+        theta = theta_of(other)
         parts.append((f"material {hexadecimal(theta)}", _march(stepper, u[GOLDEN_STEPS:])))
     most = np.abs(np.concatenate([y for _, y in parts])).max(axis=0)
     units = [label.unit for label in plant.outputs]

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from softgrasp.fem.pymor import Factors, Term, operator, port, pymor_models
-from softgrasp.reduction.export.affine import material_terms
+from softgrasp.reduction.export.affine import FIXED, material_terms
 from softgrasp.reduction.model import ReducedModel
 
 
@@ -27,7 +27,9 @@ def parametric(model: ReducedModel) -> Any:
     for i in range(layers):
         add(("mu",), i, mu[i])
         add(("lambda",), i, lam[i])
-        if model.damped:
+        if model.materials[i].adds == "damping":
+            add(("mu",), i, beta_mu[i])
+        elif model.damped:
             add(("beta", "mu"), i, beta_mu[i])
             add(("beta", "lambda"), i, beta_lambda[i])
     if model.coordinates == "qv":
@@ -44,7 +46,7 @@ def parametric(model: ReducedModel) -> Any:
 def _by_density(model: ReducedModel, A: list[Term], E: list[Term]) -> tuple[Term, Term]:
     """Split the constant terms by rho of every layer, append its parts, and return what is left."""
     own, constant = model.parameters(model.materials), (A[0][2], E[0][2])
-    empty = [replace(m, mu=0.0, lam=0.0, beta=0.0) for m in model.materials]
+    empty = [m if m.adds in FIXED else replace(m, mu=0.0, lam=0.0, beta=0.0) for m in model.materials]
     left = [X.copy() for X in constant]
     for i, m in enumerate(empty):
         twice = (*empty[:i], replace(m, rho=2 * m.rho), *empty[i + 1 :])

@@ -6,6 +6,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import ufl
 from mpi4py import MPI
 
 import softgrasp as sg
@@ -29,10 +30,23 @@ def of_kind(kind: tuple[Any, Any, bool], *changes: dict[str, Any]) -> ReducedMod
     return reduced(model, symplectic_basis(model.system.layout, 4, frame, fixed, coordinates, lift=coordinates == "qv"))
 
 
+def with_terms(method: str, *keys: str) -> ReducedModel:
+    """A model that the hand feels with an own term of every kind."""
+    terms = [
+        sg.Term("bed", lambda u, v: ufl.inner(u, v) * ufl.ds, 20.0),
+        sg.Term("air", lambda u, v: ufl.inner(u, v) * ufl.dx, 0.4, adds="damping"),
+        sg.Term("skin", lambda u, v: ufl.inner(u, v) * ufl.ds, 0.1, adds="mass"),
+        sg.Term("pull", lambda v: v[0] * ufl.dx, 0.3, adds="load"),
+    ]
+    model = sg.build("paper_lqr", ["tissue.cells=[4, 8]", "effects.reaction=true", *keys], terms=terms)
+    return sg.reduce(model, sg.simulate(model), method, N=14)
+
+
 MODELS = {
     "gravity": cache(lambda: rom(DAMPED, GRAVITY)),
     "undamped": cache(lambda: rom({})),
     "layers": lambda: rom(DAMPED, {"tissue": {"layers": LAYERS}}),
+    "own terms": cache(lambda: with_terms("craig_bampton")),
     "viscosity in E": lambda: of_kind(("qp", "absolute", False), DAMPED),
 }
 

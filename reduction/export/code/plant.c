@@ -48,6 +48,10 @@ static void force(const sg_plant *plant, const double *u, double r[N]) {
 static int possible(const double *theta) {
     for (int l = 0; l < SG_PLANT_LAYERS; ++l) {
         double mu = theta[3 * l], lambda = theta[3 * l + 1], beta = theta[3 * l + 2];
+        if (l >= SG_PLANT_MATERIALS) { /* an own parameter, whose lambda is 0 */
+            if (!(mu >= 0 && beta >= 0) || lambda < 0 || lambda > 0) return 0;
+            continue;
+        }
         if (!(mu > 0 && lambda > -2 * mu / 3 && beta >= 0) || (!SG_PLANT_DAMPED && beta > 0)) return 0;
     }
     return 1;
@@ -144,7 +148,7 @@ const char *sg_plant_message(int status) {
     case SG_PLANT_OK: return "done";
     case SG_PLANT_NOT_FINITE: return "an input is not a finite number; nothing has changed";
     case SG_PLANT_MATERIAL:
-        return SG_PLANT_DAMPED ? "no elastic material: mu must be > 0, lambda > -2 mu / 3 and beta >= 0"
+        return SG_PLANT_DAMPED ? "no elastic material: mu must be > 0, lambda > -2 mu / 3 and beta >= 0, own parameters >= 0"
                                : "no material of this model: mu must be > 0, lambda > -2 mu / 3 and beta = 0, for the "
                                  "model was reduced without damping";
     case SG_PLANT_SINGULAR: return "the step has no solution with this material; the last one stays";

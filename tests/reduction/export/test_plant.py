@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import ufl
 
 import softgrasp as sg
 from softgrasp.fem.errors import ResourceError
 from softgrasp.reduction.export import write_c
 from softgrasp.reduction.export.affine import affine_plant
 from softgrasp.reduction.system import ModelError, UnstableModelError
-from tests.helpers.exported import MODELS, of_kind, state_matrices
+from tests.helpers.exported import MODELS, of_kind, state_matrices, with_terms
 from tests.helpers.models import LAYERS
 from tests.helpers.reduced import DAMPED, KINDS
 
@@ -56,6 +57,39 @@ def test_c_takes_our_own_steps(name: str, tmp_path: Path) -> None:
     least = 1e-11 if name == "undamped" else 1e-13
     assert all(least <= float(allowed) <= 10 * least for _, allowed in found)  # these bases are well-conditioned
     assert all(0 < float(value) <= float(allowed) for value, allowed in found)
+
+
+@pytest.mark.parametrize("method", ["craig_bampton", "psd"])
+def test_own_terms_are_called_by_their_names_and_masses_and_loads_stay(method: str) -> None:
+    """Also in canonical coordinates, where own damping is part of E."""
+    model = with_terms(method)
+    plant = affine_plant(model, 1e-3)
+    names = [label.name for label, able in zip(plant.constants(), plant.tunable(), strict=True) if able]
+    assert names == ["mu", "lambda", "beta", "bed", "beta_bed", "air"]
+    rows = {m.part: i for i, m in enumerate(model.materials)}
+    changed = list(model.materials)
+    theta = plant.theta.copy()
+    for part, value in (("bed", 55.0), ("air", 0.9)):
+        changed[rows[part]] = replace(changed[rows[part]], mu=value)
+        theta[rows[part], 0] = value
+    E, A = state_matrices(plant, theta)
+    system = model.at(tuple(changed))
+    ours, theirs = np.linalg.solve(E, A), np.linalg.solve(system.E * plant.d, system.A * plant.d)
+    assert abs(ours - theirs).max() < 1e-10 * abs(theirs).max()  # two inverses of matrices of condition 1e4
+    assert plant.f.any()
+
+
+def test_parameters_of_an_energy_have_its_names_in_every_layer() -> None:
+    def W(F: Any, p: Any) -> Any:
+        log, stretch = ufl.ln(ufl.det(F)), ufl.dot(F[:, 0], F[:, 0]) - 1
+        return p.mu / 2 * (ufl.inner(F, F) - 2) - p.mu * log + p.lam / 2 * log**2 + p.k1 / 4 * stretch**2
+
+    tissue = {"cells": [4, 8], "energy": "given", "parameters": {"k1": 20.0}, "layers": LAYERS}
+    model = sg.build("paper_lqr", tissue=tissue, energy=W)
+    plant = affine_plant(sg.reduce(model, sg.simulate(model), "craig_bampton", N=14), 1e-3)
+    names = [label.name for label, able in zip(plant.constants(), plant.tunable(), strict=True) if able]
+    assert len(set(names)) == len(names)
+    assert {"mu_1", "mu_2", "k1_1", "k1_2", "beta_k1_2"} <= set(names)
 
 
 def test_the_tolerance_is_what_rounding_of_the_model_changes(tmp_path: Path) -> None:
