@@ -74,7 +74,7 @@ def controller_texts(controller: Controller) -> dict[str, str]:
     }  # fmt: skip
     words = ", ".join(f"{key} {value}" for key, value in controller.about.items())
     size = [comment(f"{words}; a tick of {controller.period!r} s".replace("*/", "")), "/*"]
-    groups = {"q": _hand(controller, ""), "v": _hand(controller, "/s"), "y": _others(controller)}
+    groups = {"q": hand_names(controller, ""), "v": hand_names(controller, "/s"), "y": other_names(controller)}
     for letter, names in (groups | {"u": controller.plant.inputs}).items():
         size += [f"   {letter}[{i}]  {name}".replace("*/", "") for i, name in enumerate(names)]
     size += ["*/"] + [f"#define SG_CONTROLLER_{key} {value}" for key, value in numbers.items()]
@@ -113,14 +113,14 @@ def plan_arrays(controller: Controller, own: Program) -> tuple[dict[str, int | s
     return sizes, arrays
 
 
-def _hand(controller: Controller, rate: str) -> list[str]:
+def hand_names(controller: Controller, rate: str) -> list[str]:
     """Names of q and v with their units."""
     kind = {"": "position", "/s": "velocity"}[rate]
     axes = [name.split(" [")[0].split("_", 1) for name in controller.plant.inputs]
     return [f"{kind} {axis} [{'rad' if what == 'torque' else 'm'}{rate}]" for what, axis in axes]
 
 
-def _others(controller: Controller) -> tuple[str, ...]:
+def other_names(controller: Controller) -> tuple[str, ...]:
     """Names of the samples beside those of the hand."""
     own = controller.observer
     return () if own is None else own.names[len(own.C) - own.others :]

@@ -144,8 +144,8 @@ def affine_plant(model: ReducedModel, tick: float) -> AffinePlant:
         C=np.vstack([system.S_q, system.S_v, system.C]) * d,
         start=_rest(system) / d,
         d=d,
-        inputs=_named(system.inputs),
-        outputs=_hand(system) + _named(system.outputs),
+        inputs=named(system.inputs),
+        outputs=_hand(system) + named(system.outputs),
         rows=model.materials,
     )
     names = [label.name for label in (*plant.inputs, *plant.outputs, *plant.constants())]
@@ -205,7 +205,7 @@ def _rest(system: EnergySystem) -> Array:
     return system.equilibrium() if system.hand_first else np.zeros(system.N)
 
 
-def _named(texts: tuple[str, ...]) -> tuple[Label, ...]:
+def named(texts: tuple[str, ...]) -> tuple[Label, ...]:
     """Of "tip_x [m]"."""
     return tuple(Label(*text.rstrip("]").rsplit(" [", 1)) for text in texts)
 

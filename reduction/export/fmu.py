@@ -10,11 +10,12 @@ import subprocess
 import tempfile
 import xml.etree.ElementTree as ET
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 
 from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.owned import note
-from softgrasp.reduction.export.affine import AffinePlant, Label, affine_plant
+from softgrasp.reduction.export.affine import Label, affine_plant
 from softgrasp.reduction.export.c import CODE
 from softgrasp.reduction.export.plant import plant_texts
 from softgrasp.reduction.model import ReducedModel
@@ -38,6 +39,18 @@ UNITS: dict[str, dict[str, str]] = {  # exponents of the base units
 }
 
 
+@dataclass(frozen=True)
+class Face:
+    """What an importer sees of an FMU."""
+
+    description: str  # in words
+    tick: float  # step of co-simulation [s]
+    inputs: tuple[Label, ...]  # held over a tick
+    outputs: tuple[Label, ...]  # after each step
+    constants: tuple[tuple[int, Label, float], ...] = ()  # place, label and value of those that may be changed
+    states: tuple[float, ...] | None = None  # at the start, for model exchange; None: co-simulation alone
+
+
 def write_fmu(model: ReducedModel, path: str | Path, tick: float = 1e-3) -> Path:
     """Write a file of FMI 3.0 for co-simulation and model exchange, sources and a binary for this machine inside.
 
@@ -56,19 +69,41 @@ def write_fmu(model: ReducedModel, path: str | Path, tick: float = 1e-3) -> Path
     """
     path, plant = Path(path), affine_plant(model, tick)
     texts = {name: (CODE / name).read_text() for name in ("plant.c", "plant.h", "vector.h")} | plant_texts(plant)
-    texts |= {file.name: file.read_text() for file in FMI.iterdir() if file.suffix in (".c", ".h")}
+    numbers = zip(plant.constants(), plant.theta.ravel().tolist(), plant.tunable(), strict=True)
+    face = Face(
+        f"Hand and tissue, {plant.name}, {plant.N} states", plant.tick, plant.inputs, plant.outputs,
+        tuple((i, label, value) for i, (label, value, able) in enumerate(numbers) if able),
+        tuple(plant.start.tolist()),
+    )  # fmt: skip
+    return write_archive(path, texts, face)
+
+
+def write_archive(path: Path, texts: dict[str, str], face: Face, sources: tuple[str, ...] = SOURCES) -> Path:
+    """Write an FMU of texts in C and what they need of FMI. Not collective.
+
+    Args:
+        path: file to write.
+        texts: files of C by name, with the interface of plant.h.
+        face: what an importer sees.
+        sources: names of those that are compiled.
+
+    Raises:
+        ModelError: no C compiler.
+        ResourceError: the file cannot be written; what was there stays.
+    """
+    texts = texts | {file.name: file.read_text() for file in FMI.iterdir() if file.suffix in (".c", ".h")}
     token = "{" + hashlib.sha256("\0".join(f"{k}\0{v}" for k, v in sorted(texts.items())).encode()).hexdigest() + "}"
     texts["token.h"] = f'#define TOKEN "{token}"\n'
-    texts["buildDescription.xml"] = _text(_build())
+    texts["buildDescription.xml"] = _text(_build(sources))
     fresh = path.with_name(f"new-{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         note(path)
         with zipfile.ZipFile(fresh, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("modelDescription.xml", _text(_description(plant, token)))
+            archive.writestr("modelDescription.xml", _text(_description(face, token)))
             for name, text in sorted(texts.items()):
                 archive.writestr(f"sources/{name}", text)
-            archive.writestr(f"binaries/{platform.machine()}-linux/{NAME}.so", _compiled(texts))
+            archive.writestr(f"binaries/{platform.machine()}-linux/{NAME}.so", _compiled(texts, sources))
         fresh.replace(path)
     except OSError as error:
         raise ResourceError(f"{path} cannot be written ({error.strerror or error}); name another file") from error
@@ -77,7 +112,7 @@ def write_fmu(model: ReducedModel, path: str | Path, tick: float = 1e-3) -> Path
     return path
 
 
-def _compiled(texts: dict[str, str]) -> bytes:
+def _compiled(texts: dict[str, str], sources: tuple[str, ...]) -> bytes:
     """The shared library of these sources. Raises ModelError: there is no compiler, or it refuses them."""
     compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
@@ -85,7 +120,7 @@ def _compiled(texts: dict[str, str]) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         for name, text in texts.items():
             (Path(folder) / name).write_text(text)
-        command = [*compiler.split(), *FLAGS, *SOURCES, "-o", f"{NAME}.so"]
+        command = [*compiler.split(), *FLAGS, *sources, "-o", f"{NAME}.so"]
         try:
             subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)
         except (OSError, subprocess.CalledProcessError) as error:
@@ -94,32 +129,33 @@ def _compiled(texts: dict[str, str]) -> bytes:
         return (Path(folder) / f"{NAME}.so").read_bytes()
 
 
-def _build() -> ET.Element:
+def _build(sources: tuple[str, ...]) -> ET.Element:
     root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
     files = ET.SubElement(ET.SubElement(root, "BuildConfiguration", modelIdentifier=NAME), "SourceFileSet")
     files.set("language", "C99")
-    for name in SOURCES:
+    for name in sources:
         ET.SubElement(files, "SourceFile", name=name)
     return root
 
 
-def _description(plant: AffinePlant, token: str) -> ET.Element:
+def _description(face: Face, token: str) -> ET.Element:
     """modelDescription.xml."""
     root = ET.Element(
         "fmiModelDescription", fmiVersion="3.0", modelName=NAME, instantiationToken=token, generationTool="softgrasp",
-        variableNamingConvention="flat", description=f"Hand and tissue, {plant.name}, {plant.N} states",
+        variableNamingConvention="flat", description=face.description,
     )  # fmt: skip
-    tick, own = repr(plant.tick), {"modelIdentifier": NAME, "canGetAndSetFMUState": "true"}
-    ET.SubElement(root, "ModelExchange", own)
+    tick, own = repr(face.tick), {"modelIdentifier": NAME, "canGetAndSetFMUState": "true"}
+    if face.states is not None:
+        ET.SubElement(root, "ModelExchange", own)
     steps = {"canHandleVariableCommunicationStepSize": "true", "fixedInternalStepSize": tick}
     ET.SubElement(root, "CoSimulation", own | steps)
-    _units(root, plant)
+    _units(root, face)
     errors = ET.SubElement(ET.SubElement(root, "LogCategories"), "Category", name="logStatusError")
     errors.set("description", "one sentence for everything that is refused")
-    ET.SubElement(root, "DefaultExperiment", startTime="0", stopTime=repr(1000 * plant.tick), stepSize=tick)
-    _variables(ET.SubElement(root, "ModelVariables"), plant)
+    ET.SubElement(root, "DefaultExperiment", startTime="0", stopTime=repr(1000 * face.tick), stepSize=tick)
+    _variables(ET.SubElement(root, "ModelVariables"), face)
     structure = ET.SubElement(root, "ModelStructure")
-    outputs, rates = range(OUTPUT, OUTPUT + len(plant.outputs)), range(RATE, RATE + plant.N)
+    outputs, rates = range(OUTPUT, OUTPUT + len(face.outputs)), range(RATE, RATE + len(face.states or ()))
     for kind, references in (
         ("Output", outputs), ("ContinuousStateDerivative", rates), ("InitialUnknown", [*outputs, *rates]),
     ):  # fmt: skip
@@ -128,30 +164,29 @@ def _description(plant: AffinePlant, token: str) -> ET.Element:
     return root
 
 
-def _units(root: ET.Element, plant: AffinePlant) -> None:
-    used = {label.unit for label in (*plant.inputs, *plant.outputs, *plant.constants()) if label.unit}
+def _units(root: ET.Element, face: Face) -> None:
+    used = {label.unit for label in (*face.inputs, *face.outputs, *(label for _, label, _ in face.constants))}
     units = ET.SubElement(root, "UnitDefinitions")
-    for unit in sorted(used | {"s"}):
+    for unit in sorted(used & set(UNITS) | {"s"}):
         ET.SubElement(ET.SubElement(units, "Unit", name=unit), "BaseUnit", UNITS[unit])
 
 
-def _variables(parent: ET.Element, plant: AffinePlant) -> None:
+def _variables(parent: ET.Element, face: Face) -> None:
     def add(reference: int, label: Label, causality: str, **attributes: str) -> None:
         given = {"name": label.name, "valueReference": str(reference), "causality": causality} | attributes
-        ET.SubElement(parent, "Float64", given | ({"unit": label.unit} if label.unit else {}))
+        ET.SubElement(parent, "Float64", given | ({"unit": label.unit} if label.unit in UNITS else {}))
 
     add(0, Label("time", "s"), "independent", variability="continuous")
-    for i, label in enumerate(plant.inputs):
+    for i, label in enumerate(face.inputs):
         add(INPUT + i, label, "input", start="0", description="held over a tick")
-    for i, label in enumerate(plant.outputs):
+    for i, label in enumerate(face.outputs):
         add(OUTPUT + i, label, "output", initial="calculated")
-    for i, (label, value, able) in enumerate(zip(plant.constants(), plant.theta.ravel(), plant.tunable(), strict=True)):
-        if able:
-            add(CONSTANT + i, label, "parameter", variability="tunable", start=repr(float(value)))
-    for i, value in enumerate(plant.start):
+    for i, label, value in face.constants:
+        add(CONSTANT + i, label, "parameter", variability="tunable", start=repr(value))
+    for i, value in enumerate(face.states or ()):
         state = Label(f"w_{i + 1}", "")
-        add(STATE + i, state, "local", initial="exact", start=repr(float(value)), description="energy coordinate")
-    for i in range(plant.N):
+        add(STATE + i, state, "local", initial="exact", start=repr(value), description="energy coordinate")
+    for i in range(len(face.states or ())):
         add(RATE + i, Label(f"der_w_{i + 1}", ""), "local", initial="calculated", derivative=str(STATE + i))
 
 

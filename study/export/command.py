@@ -30,7 +30,8 @@ def export(
 
     The C allocates nothing and calls no library. It brings a log of our own steps, which `make test` compares.
 
-    The FMU (FMI 3.0, co-simulation and model exchange) holds the same C and a binary for this machine.
+    The FMU (FMI 3.0; of a model co-simulation and model exchange, of a controller co-simulation) contains the same C
+    and a binary for this machine.
 
     Example: softgrasp reduce paper_forward, then
     softgrasp export out/paper_forward-reduce/models/craig_bampton.h5 --c plant --fmu plant.fmu; make -C plant test time

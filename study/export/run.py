@@ -1,4 +1,4 @@
-"""``softgrasp export``: a saved reduced model as C and as FMU, a controller as C."""
+"""``softgrasp export``: a saved reduced model or controller, as C and as FMU."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def run_export(
         path: reduced model (.h5) or controller (.npz).
         console: terminal.
         c: folder of the C code; None for none.
-        fmu: file of the FMU, of a model only; None for none.
+        fmu: file of the FMU; None for none.
         tick: time between two steps of an exported model [s]; a controller has its own.
 
     Raises:
@@ -52,12 +52,11 @@ def _export(path: Path, console: Console, c: Path | None, fmu: Path | None, tick
 
 
 def _controller(path: Path, console: Console, c: Path | None, fmu: Path | None) -> list[Path]:
-    """Files of the C code of a controller. Raises SceneError: an FMU was asked for."""
+    """Files of the C code and the FMU of a controller."""
     from softgrasp.lqr.export.controller import write_controller  # with lqr, which models do not need
+    from softgrasp.lqr.export.fmu import write_controller_fmu
     from softgrasp.lqr.loop.controller import Controller
 
-    if fmu is not None or c is None:
-        raise SceneError(f"--fmu {fmu}: {path} is a controller, which is exported with --c FOLDER")
     controller = Controller.load(path)
     seen = "no observer" if controller.observer is None else f"an observer of {len(controller.observer.C)} samples"
     if controller.planner is not None:
@@ -65,7 +64,8 @@ def _controller(path: Path, console: Console, c: Path | None, fmu: Path | None) 
         seen += f", a plan of {own.variables} variables and {own.count(0)} to {own.count(own.H)} rows"
     text = f"{path.name}: N = {controller.plant.N}, {seen}, a tick of {controller.period:g} s"
     console.print(text, soft_wrap=True, markup=False)
-    return write_controller(controller, c)
+    files = [] if c is None else write_controller(controller, c)
+    return files + ([] if fmu is None else [write_controller_fmu(controller, fmu)])
 
 
 def _model(path: Path, console: Console, c: Path | None, fmu: Path | None, tick: float) -> list[Path]:

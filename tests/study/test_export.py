@@ -44,6 +44,15 @@ def test_a_saved_model_becomes_c(tmp_path: Path) -> None:
     assert "unstable with other materials" in " ".join(export(file, "--c", folder).split())
 
 
+def test_a_controller_becomes_c_and_an_fmu(tmp_path: Path) -> None:
+    model = sg.build("paper_lqr", ["tissue.cells=[2, 4]"])
+    sg.make_controller(sg.design(model), order=8).save(tmp_path / "controller.npz")
+    output = export(tmp_path / "controller.npz", "--c", tmp_path / "robot", "--fmu", tmp_path / "robot.fmu")
+    assert zipfile.is_zipfile(tmp_path / "robot.fmu")
+    assert "no observer" in output
+    assert (tmp_path / "robot" / "controller.c").exists()
+
+
 def test_finite_strain_is_refused(tmp_path: Path) -> None:
     model = sg.build("paper_forward", ["tissue.cells=[2, 4]", "time.steps=20", "effects.finite_strain={}"])
     file = tmp_path / "strain.h5"
