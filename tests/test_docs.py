@@ -30,6 +30,7 @@ MESHED = (
     "pillow_3d",
     "set_down_3d",
     "turn_over_3d",
+    "reach_over_3d",
     "paper_accurate",
     "franka_muscle",
     "layers_2d",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +19,67 @@ from softgrasp.fem.scene.table import read_csv
 Array = NDArray[Any]
 GRAZE = 1e-6  # depth over the thickness of an obstacle that a line on its surface may have [1]
 THIRDS = 60  # searches, each of which leaves two thirds of a line: 3e-11 of it
-Path = Callable[[float, int], Array]
-"""Displacement (d,) [m] of an obstacle at a time [s], or its derivative of a given order."""
+
+
+class Path(ABC):
+    """A known translation over time."""
+
+    @abstractmethod
+    def __call__(self, t: float, order: int = 0) -> Array:
+        """Displacement (d,) [m] at a time [s], or its derivative of a given order."""
+
+    @property
+    @abstractmethod
+    def end(self) -> float:
+        """Time from which the obstacle rests [s]; infinite where it never does."""
+
+    @abstractmethod
+    def fastest_turn(self, begin: float, end: float) -> Array:
+        """Bound on the acceleration along every axis between two times [m/s2], (d,)."""
+
+
+@dataclass(frozen=True)
+class Uniform(Path):
+    """A constant velocity."""
+
+    velocity: Array  # [m/s], (d,)
+
+    def __call__(self, t: float, order: int = 0) -> Array:
+        """See :meth:`Path.__call__`."""
+        return np.asarray((t if order == 0 else float(order == 1)) * self.velocity)
+
+    @property
+    def end(self) -> float:
+        """See :meth:`Path.end`."""
+        return math.inf if self.velocity.any() else 0.0
+
+    def fastest_turn(self, begin: float, end: float) -> Array:
+        """See :meth:`Path.fastest_turn`; a constant velocity has none."""
+        return np.zeros(len(self.velocity))
+
+
+@dataclass(frozen=True)
+class Spline(Path):
+    """A cubic spline at rest at both ends; later the obstacle rests where it ends."""
+
+    spline: Any  # of scipy.interpolate, displacement (d,) [m] over time [s]
+
+    def __call__(self, t: float, order: int = 0) -> Array:
+        """See :meth:`Path.__call__`."""
+        if t > self.end:  # a longer run of a reduced model finds the obstacle at rest there
+            return np.asarray(self.spline(self.end) if order == 0 else np.zeros(self.spline.c.shape[2]))
+        return np.asarray(self.spline(t, order))
+
+    @property
+    def end(self) -> float:
+        """See :meth:`Path.end`."""
+        return float(self.spline.x[-1])
+
+    def fastest_turn(self, begin: float, end: float) -> Array:
+        """See :meth:`Path.fastest_turn`; the acceleration is linear between the times of the table."""
+        inside = self.spline.x[(self.spline.x > begin) & (self.spline.x < end)]
+        times = np.clip(np.concatenate([[begin], inside, [end]]), None, self.end)
+        return np.asarray(np.abs(self.spline(times, 2)).max(axis=0))
 
 
 @dataclass(frozen=True)
@@ -145,11 +204,8 @@ def make_path(scene: Scene, entry: keys.Obstacle, key: str, d: int) -> Path | No
     if entry.path is None:
         return None
     if entry.path.csv is None:
-        velocity = np.array(entry.path.velocity, dtype=float)
-        return lambda t, order: velocity if order else t * velocity
+        return Uniform(np.array(entry.path.velocity, dtype=float))
     from scipy.interpolate import CubicSpline  # few scenes need it
 
-    times, values = read_csv(scene.path(entry.path.csv), d, scene.time_end, key, "one displacement per axis")
-    spline = CubicSpline(times, values, bc_type="clamped")
-    end = float(times[-1])  # a longer run of a reduced model finds the obstacle at rest there
-    return lambda t, order: np.asarray(spline(min(t, end), order))
+    times, values = read_csv(scene.path(entry.path.csv), d, None, key, "one displacement per axis")
+    return Spline(CubicSpline(times, values, bc_type="clamped"))

@@ -31,7 +31,7 @@ class Path(Section):
     csv: str | None = Field(
         None,
         description="table, relative to the scene: t [s], then the displacement along each axis [m], joined by a cubic "
-        "spline at rest at both ends; excludes velocity",
+        "spline at rest at both ends, and at rest behind its end; excludes velocity",
     )
 
     @model_validator(mode="after")

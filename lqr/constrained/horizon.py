@@ -21,6 +21,8 @@ from softgrasp.lqr.constrained.tissue import ModalTissue
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
+DOUBLINGS = 64  # more than any loop takes that is stable in double precision
+
 
 @dataclass(frozen=True)
 class HeldPlant:
@@ -89,15 +91,38 @@ def held_plant(problem: RiccatiProblem, tissue: ModalTissue, grid: float, parts:
         ) from None
     weight = R_d + B_d.T @ P @ B_d
     K = -np.linalg.solve(weight, B_d.T @ P @ A_d + S_d.T)
-    return HeldPlant(A, B, Y, grid, parts, (P + P.T) / 2, K, np.linalg.inv(np.linalg.cholesky(weight)).T, tissue)
+    P = _sum_of_costs(A_d + B_d @ K, W, K)
+    return HeldPlant(A, B, Y, grid, parts, P, K, np.linalg.inv(np.linalg.cholesky(weight)).T, tissue)
+
+
+def _sum_of_costs(F: Array, W: Array, K: Array) -> Array:
+    """P = sum_k F'^k [I; K]'W [I; K] F^k, by doubling.
+
+    A sum of what is positive: fast modes of small cost keep digits that the Riccati solver loses beside the large ones.
+    """
+    law = np.vstack([np.eye(len(F)), K])
+    P = law.T @ W @ law
+    for _ in range(DOUBLINGS):
+        more = F.T @ P @ F
+        P, F = P + more, F @ F
+        if np.abs(more).max() <= np.finfo(float).eps * np.abs(P).max():
+            break
+    return np.asarray((P + P.T) / 2)
 
 
 def held_cost(A: Array, B: Array, W: Array, s: float) -> Array:
-    """W_d with int_0^s [x; u]'W [x; u] dt = [x_0; u]'W_d [x_0; u] for a held input [VL78]."""
+    """W_d with int_0^s [x; u]'W [x; u] dt = [x_0; u]'W_d [x_0; u] for a held input [VL78].
+
+    Of a part of s in which nothing decays by much, then doubled, W_2s = W_s + E_s'W_s E_s: e^{-F's} alone overflows.
+    """
     n, m = len(W), B.shape[1]
     F = np.block([[A, B], [np.zeros((m, n))]])
-    E = scipy.linalg.expm(np.block([[-F.T, W], [np.zeros((n, n)), F]]) * s)
-    result = E[n:, n:].T @ E[:n, n:]
+    doublings = max(0, int(np.ceil(np.log2(max(float(np.linalg.norm(F, 1)) * s, 1.0)))))
+    both = scipy.linalg.expm(np.block([[-F.T, W], [np.zeros((n, n)), F]]) * (s / 2**doublings))
+    E = both[n:, n:]
+    result = E.T @ both[:n, n:]
+    for _ in range(doublings):
+        result, E = result + E.T @ result @ E, E @ E
     return np.asarray((result + result.T) / 2)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.constrained.horizon import HeldPlant, held
-from softgrasp.lqr.constrained.plan import ROOM, Plan, _at_target, _free, _price
+from softgrasp.lqr.constrained.plan import ROOM, Plan, _at_target, _free, _price, _times, _turns
 from softgrasp.lqr.constrained.rows import Limits, _pace, both_ends, follow, swings
 from softgrasp.lqr.loop.controller import Controller
 from softgrasp.lqr.plant.checks import ControlError
@@ -27,6 +27,8 @@ SHARE = 0.5  # of the largest value of a mode in it: the same of the tissue
 STILL = 3e-3  # of the extent: the same, and bend, of a mode that the first plan hardly moves
 FASTER = 1.0  # times the largest swing of a mode in it: by how much it may swing more
 FREER = 3.0  # times the largest force of the first plan, where the scene limits none
+DIGITS = 1e-10  # of the extent: what a row keeps beyond its bound, so that rounding breaks none
+ROUNDS = 4  # of the first plan under its own rows
 TAIL = 50  # intervals behind the horizon whose swings the rows at the target have room for
 ROUNDING = 1e-6  # of the extent: a deviation that the steps of another rule make
 
@@ -127,7 +129,7 @@ def make_program(plan: Plan, T: Array, x_bar: Array, ticks: Ticks, period: float
 
     Raises ControlError: the plan does not keep everything, or an interval is no multiple of the tick.
     """
-    plant, task, H, limits = plan.horizon.plant, plan.task, plan.horizon.steps, plan.task.limits
+    plant, limits = plan.horizon.plant, plan.task.limits
     if plan.depth > 0 or not plan.gap >= 0 or plan.unsafe:
         raise ControlError(f"only a plan that keeps everything is made again online; {plan.reason}")
     every = round(plant.grid / period)
@@ -136,15 +138,28 @@ def make_program(plan: Plan, T: Array, x_bar: Array, ticks: Ticks, period: float
             f"control.constraints.grid = {plant.grid:g} s must be a multiple of the tick of {period:g} s of a loop "
             "that follows a plan"
         )
+    force, reason = limits.force, ""
+    if force is None:
+        force = FREER * np.abs(plan.inputs).max(axis=0)
+    for _ in range(ROUNDS):  # the room between two instants is that of the plan before
+        program = _program(plan, T, x_bar, ticks, every, force)
+        begins = replace(program, c=program.solve(0, program.start)[0])
+        reason = begins.judge(0, program.start, begins.c)
+        if not reason:
+            return begins
+        plan = replace(plan, c=begins.c.ravel())
+    raise ControlError(f"the plan is not safe with the coarser bounds of a program online: {reason}")
+
+
+def _program(plan: Plan, T: Array, x_bar: Array, ticks: Ticks, every: int, force: Array) -> Program:
+    """The program with what a plan needs between two instants."""
+    plant, task, H, limits = plan.horizon.plant, plan.task, plan.horizon.steps, plan.task.limits
     flow, n_s = _Flow(plant, limits.jump is not None), plant.n_s
     A, B = (np.stack(parts) for parts in zip(*plant.held, strict=True))
     flows, drives = flow.wide(A + B @ plant.K), B @ plant.L  # (parts + 1, N, n), (parts + 1, N, n_s)
     F, D = flow.long(flows[-1], flow.wide(plant.K)), flow.long(drives[-1], plant.L)
-    rows = _Rows(flow, H, flows, drives, (plant.grid / plant.parts) ** 2 / 8)
+    rows = _Rows(flow, H, flows, drives, (plant.grid / plant.parts) ** 2 / 8, DIGITS * _extent(plan))
     first_way = _way(plan, rows.chord)
-    force = limits.force
-    if force is None:
-        force = FREER * np.abs(first_way.u + task.u_bar).max(axis=0)
     first = _all_rows(rows, plan, first_way, force, F, D)
     a, d, free, exact, obstacle, part, leaves, along = rows.arrays()
     real, imag = _tail(plan, flow, flows, F, force, limits)
@@ -163,32 +178,32 @@ def make_program(plan: Plan, T: Array, x_bar: Array, ticks: Ticks, period: float
     tube = np.broadcast_to(task.noise, task.places.shape) + ROUNDING * _extent(plan)
     rest = x_bar.copy()
     rest[:n_s] += task.start[:n_s]
-    program = Program(
+    return Program(
         F, D, flow.wide(plant.K), plant.L, a, np.hstack(lags[::-1]), free, exact, obstacle, part, leaves, along,
         first, swing_x, swing_c, first_way.most,
         flows[:, first_way.near], drives[:, first_way.near], way, first_way.c, first_way.boxes,
         real, imag, flow.wide(plant.Y.reshape(-1, plant.N)), tube.ravel(), way[0],
         first_way.c, _price(plan.horizon, task) / 2, T, ticks.A, ticks.B, ticks.f, rest, every,
     )  # fmt: skip
-    begins = replace(program, c=program.solve(0, way[0])[0])
-    reason = begins.judge(0, way[0], begins.c)
-    if reason:
-        raise ControlError(f"the plan is not safe with the coarser bounds of a program online: {reason}")
-    return begins
 
 
 def _all_rows(rows: _Rows, plan: Plan, way: _Way, force: Array, F: Array, D: Array) -> NDArray[np.int64]:
     """Rows of every interval and of all later ones; the first of each, (H + 2,)."""
     plant, task, H = plan.horizon.plant, plan.task, plan.horizon.steps
-    first, target, largest = [0], _at_target(task), force + np.abs(task.u_bar)
+    first, target, largest = [0], _at_target(task, H * plant.grid), force + np.abs(task.u_bar)
+    ends = np.vstack([_times(plan.horizon), np.full((1, plant.parts + 1), H * plant.grid)])
+    turns = [np.broadcast_to(_turns(plan.horizon, task, o, n), (H, plant.parts)) for o, n in enumerate(plan.normals)]
     for k in range(H + 1):
         for o, (shape, (at_end, _)) in enumerate(zip(task.shapes, target, strict=True)):
             n = plan.normals[o, k] if k < H else at_end
             x = way.x[k] if k < H else np.zeros_like(way.x[0])
             moved = x @ np.einsum("d,jdn->jn", n, plant.Y).T
             inputs = way.u[k] if k < H else way.pushed
+            free = _free(shape, task, n[None])[0] - (task.shifts(o, ends[k]) @ n)[:, None]
+            if k < H:  # later it rests, or goes away along a line
+                free = free - rows.chord * both_ends(turns[o][k : k + 1, :, None])[0]
             rows.gaps(
-                o, n, _free(shape, task, n[None])[0], moved, way.planned[k], way.most[k], way.boxes[k], way.near,
+                o, n, free, moved, way.planned[k], way.most[k], way.boxes[k], way.near,
                 inputs, largest,
             )  # fmt: skip
         rows.limits(force, task.limits, task.u_bar, F, D)
@@ -199,7 +214,8 @@ def _all_rows(rows: _Rows, plan: Plan, way: _Way, force: Array, F: Array, D: Arr
 class _Rows:
     """Rows of a program as they are made."""
 
-    def __init__(self, flow: _Flow, H: int, flows: Array, drives: Array, chord: float) -> None:
+    def __init__(self, flow: _Flow, H: int, flows: Array, drives: Array, chord: float, slack: float) -> None:
+        self.slack = slack
         self.flow, self.H, self.flows, self.drives, self.chord = flow, H, flows, drives, chord
         self.parts: list[tuple[Array, ...]] = []
         self.count = 0
@@ -214,7 +230,7 @@ class _Rows:
     ) -> None:  # fmt: skip
         """Rows of an obstacle in an interval that the box can reach.
 
-        ``moved``: way of the nodes along n in the first plan, (parts + 1, nodes).
+        ``free``: at every instant, (parts + 1, nodes); ``moved``: way of the nodes along n in the first plan, the same.
         """
         plant = self.flow.plant
         n_s = plant.n_s
@@ -228,7 +244,7 @@ class _Rows:
         last = plant.parts - 1
         self._add(
             np.einsum("mn,mnr->mr", Y[j], self.flows[i]), np.einsum("mn,mns->ms", Y[j], self.drives[i]),
-            free[j] - ROOM * need[i, j], free[j], np.full(len(i), o),
+            free[i, j] - ROOM * need[i, j] - self.slack, free[i, j], np.full(len(i), o),
             np.column_stack([np.maximum(i - 1, 0), np.minimum(i, last)]),
             leaves[j], np.broadcast_to(along, (len(i), n_s)),
         )  # fmt: skip
@@ -268,7 +284,7 @@ def _tail(plan: Plan, flow: _Flow, flows: Array, F: Array, force: Array, limits:
     pairs = np.einsum("men,inr->imer", T, shown[:-1]) + np.einsum("mes,sr->mer", W, K)
     size = np.linalg.norm(pairs, axis=2) * _pace(plant)[None, :, None]  # (parts, modes, n)
     b = (np.abs(K) / (force - np.abs(task.u_bar))[:, None]).max(axis=0)
-    for normal, free in _at_target(task):
+    for normal, free in _at_target(task, plan.horizon.steps * plant.grid):
         rows = np.abs(np.einsum("d,jdn,inr->ijr", normal, plant.Y, shown))
         seen = np.abs(np.einsum("d,jdm->jm", normal, plant.tissue.seen))
         bend = np.einsum("jm,imr->ijr", seen, size) + np.abs(normal @ plant.B[n_s : 2 * n_s] @ K)

@@ -1,18 +1,20 @@
-"""Plans past obstacles: a sequence of problems of least distance, each with one half-plane per interval and obstacle.
+"""Plans past obstacles: a sequence of problems of least distance, each with one half-space per interval and obstacle.
 
 The half-planes of one plan separate body and obstacle, so that it is feasible for the half-planes drawn from it: costs
-fall from round to round and every round is safe. Both sides of an obstacle on the way are tried.
+fall from round to round and every round is safe. Both sides of an obstacle on the way are tried, in space four.
+That of an obstacle on a known path moves with it, n.(y - s(t)) >= h(n).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import ResourceError
+from softgrasp.fem.obstacles.obstacle import Path
 from softgrasp.fem.obstacles.shapes import HalfSpace, Shape
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.resources import free_memory, size_text
@@ -31,6 +33,7 @@ MOST_FOLLOWED = 5000  # intervals behind the horizon that are followed
 COPIES = 7  # of the rows, at the peak of a program that may exceed its gaps; 3.5 of one that keeps them
 PRICE = 20.0  # of a metre inside an obstacle, over the mean cost of a metre of the way
 SLIGHT = 1e-10  # [m]: a slack that is rounding of the price
+ROUNDING = 1e-10  # of the extent of the body [1]: what every row keeps beyond its bound
 TIGHT = 1e-9  # of the extent of the body [1]: a row so near to its bound holds the plan
 
 
@@ -39,16 +42,38 @@ class Task:
     """What a plan has to do."""
 
     start: Array  # x_0 of the reduced plant, from the target, (N,)
-    places: Array  # nodes of the body at the target [m], (nodes, 2)
+    places: Array  # nodes of the body at the target [m], (nodes, d)
     u_bar: Array  # steady input at the target [N], (n_s,)
     shapes: tuple[Shape, ...]  # obstacles
     names: tuple[str, ...]  # of the obstacles
-    error: Array  # margin for what the reduced plant leaves out at every node [m], (nodes, 2)
+    error: Array  # margin for what the reduced plant leaves out at every node [m], (nodes, d)
     clearance: float = 0.0  # distance to keep beyond that [m]
     limits: Limits = field(default_factory=Limits)  # of the hand
-    noise: Array | float = 0.0  # margin for what noise moves every node [m], (nodes, 2) or 0
+    noise: Array | float = 0.0  # margin for what noise moves every node [m], (nodes, d) or 0
     bounded: bool = True  # whether ``error`` is a proved bound
     penalty: float | None = None  # cost of a metre inside an obstacle [1/m]; None: :data:`PRICE` times that of the way
+    paths: tuple[Path | None, ...] = ()  # translation of each obstacle; empty where all are fixed
+
+    def path(self, i: int) -> Path | None:
+        """Translation of an obstacle, None for a fixed one."""
+        return self.paths[i] if self.paths else None
+
+    def shifts(self, i: int, times: Array) -> Array:
+        """Displacement of an obstacle at times [s], (.., d) [m]."""
+        path, d = self.path(i), self.places.shape[1]
+        if path is None:
+            return np.zeros((*np.shape(times), d))
+        return np.array([path(float(t)) for t in np.ravel(times)]).reshape(*np.shape(times), d)
+
+    def separate(self, i: int, body: Array, t: float) -> tuple[Array, float]:
+        """Normal between a body (nodes, d) and an obstacle at a time, and the gap [m]."""
+        return separate(self.shapes[i], body - self.shifts(i, np.asarray(t)))
+
+    def gaps(self, body: Array, times: Array) -> Array:
+        """Gap of the body (count, nodes, d) to every obstacle at times [s], (count, obstacles) [m]."""
+        count = range(len(self.shapes))
+        every = [[self.separate(i, at, t)[1] for i in count] for at, t in zip(body, times.tolist(), strict=True)]
+        return np.array(every).reshape(len(body), -1)
 
 
 @dataclass(frozen=True)
@@ -58,7 +83,7 @@ class Plan:
     horizon: Horizon  # reduced plant and number of intervals
     task: Task  # what it was made for
     c: Array  # deviations from the gain of the grid, (n_s H,)
-    normals: Array  # of the half-plane of every obstacle and interval, (obstacles, H, 2)
+    normals: Array  # of the half-plane of every obstacle and interval, (obstacles, H, d)
     slack: Array  # depth inside clearance and margin, by obstacle and interval [m], (obstacles, H)
     bend: float  # largest bound on what a node that holds the plan does between two instants [m]
     multiplier: float  # largest dJ of a metre of one gap at one instant, twice its multiplier in |c|^2 / 2 [1/m]
@@ -116,12 +141,12 @@ class Plan:
         return self.free_cost + float(self.c @ self.c)
 
     def body(self) -> Array:
-        """Places of the nodes at all instants [m], (H, parts + 1, nodes, 2)."""
+        """Places of the nodes at all instants [m], (H, parts + 1, nodes, d)."""
         return places(self.horizon, self.task, self.c)
 
 
 def places(horizon: Horizon, task: Task, c: Array) -> Array:
-    """Nodes of the reduced plant at all instants of a plan [m], (H, parts + 1, nodes, 2)."""
+    """Nodes of the reduced plant at all instants of a plan [m], (H, parts + 1, nodes, d)."""
     return np.asarray(task.places + np.einsum("jdn,kin->kijd", horizon.plant.Y, horizon.state(task.start, c)))
 
 
@@ -138,13 +163,15 @@ def make_plan(plant: HeldPlant, task: Task, steps: int, longest: int | None = No
         ControlError: the target keeps no gap or limit, or the limits of the hand cannot be kept.
         ResourceError: the quadratic program does not fit in the memory that is free now.
     """
-    level = tail_level(plant, _at_target(task), task.limits, task.u_bar)
-    if not level > 0:
-        raise ControlError("the steady force at the target is not below its limit; raise control.constraints.force")
-    if longest is None:
-        longest = LONGEST * steps
+    automatic = longest is None
+    longest = LONGEST * steps if longest is None else longest
+    steps = _after_paths(plant, task, steps, longest)
+    if automatic:
         _check_in_time(plant, task, longest * plant.grid)
     while True:
+        level = tail_level(plant, _at_target(task, steps * plant.grid), task.limits, task.u_bar)
+        if not level > 0:
+            raise ControlError("the steady force at the target is not below its limit; raise control.constraints.force")
         _check_memory(plant, task, steps)
         plan = _cheapest(Horizon(plant, steps), task, level)
         if not plan.unsafe or steps >= longest:
@@ -178,12 +205,35 @@ def _check_in_time(plant: HeldPlant, task: Task, longest: float) -> None:
         )
 
 
-def _at_target(task: Task) -> list[tuple[Array, Array]]:
-    """Normal and free way of every node at the target; raises ControlError where there is none."""
+def _after_paths(plant: HeldPlant, task: Task, steps: int, longest: int) -> int:
+    """Intervals, at least ``steps``, after which no obstacle comes nearer to the body at the target.
+
+    Raises ControlError: there are more than ``longest``.
+    """
+    for i, name in enumerate(task.names):
+        path, first = task.path(i), steps
+        if path is None:
+            continue
+        if np.isfinite(path.end):
+            steps = max(steps, int(np.ceil(path.end / plant.grid - 1e-9)))
+        else:  # at a constant velocity, for ever
+            ends = (k * plant.grid for k in range(first, longest + 1))
+            away = (task.separate(i, task.places, t)[0] @ path(t, 1) <= 0 for t in ends)
+            steps = next((first + k for k, leaves in enumerate(away) if leaves), longest + 1)
+        if steps > longest:
+            raise ControlError(
+                f"obstacle {name} moves towards the body at the target until the end of the longest plan, of "
+                f"{longest * plant.grid:.4g} s; give a path that ends or leaves, or set control.constraints.horizon"
+            )
+    return steps
+
+
+def _at_target(task: Task, t: float) -> list[tuple[Array, Array]]:
+    """Normal and free way of every node at the target, from time t on; raises ControlError where there is none."""
     result = []
-    for shape, name in zip(task.shapes, task.names, strict=True):
-        normal, gap = separate(shape, task.places)
-        free = _free(shape, task, normal[None])[0]
+    for i, (shape, name) in enumerate(zip(task.shapes, task.names, strict=True)):
+        normal, gap = task.separate(i, task.places, t)
+        free = _free(shape, task, normal[None])[0] - normal @ task.shifts(i, np.asarray(t))
         if not free.min() > 0:
             need = gap - float(free.min())
             raise ControlError(
@@ -195,25 +245,51 @@ def _at_target(task: Task) -> list[tuple[Array, Array]]:
 
 
 def _free(shape: Shape, task: Task, normals: Array) -> Array:
-    """Way of every node at the target to the half-planes of an obstacle, less clearance and margin, (count, nodes)."""
+    """Way of every node at the target to the half-spaces of an obstacle, less clearance and margin, (count, nodes).
+
+    Of the obstacle where the scene puts it.
+    """
     off = normals @ task.places.T - supports(shape, normals)[:, None]
     return np.asarray(off - task.clearance - np.abs(normals) @ (task.error + task.noise).T)
+
+
+def _times(horizon: Horizon, steps: int | None = None) -> Array:
+    """All instants of a number of intervals [s], (H, parts + 1); those behind the horizon are its end."""
+    plant, H = horizon.plant, horizon.steps
+    times = np.arange(H if steps is None else steps)[:, None] + np.arange(plant.parts + 1) / plant.parts
+    return np.asarray(plant.grid * np.minimum(times, H))
+
+
+def _turns(horizon: Horizon, task: Task, i: int, normals: Array) -> Array | float:
+    """Bound on the acceleration of an obstacle along the normals of intervals, (count, parts) [m/s2]."""
+    path = task.path(i)
+    if path is None:
+        return 0.0
+    ends = _times(horizon, len(normals))
+    most = [[path.fastest_turn(a, b) for a, b in pairwise(row)] for row in ends.tolist()]
+    return np.asarray(np.einsum("kd,kid->ki", np.abs(normals), np.array(most)))
+
+
+def _off(horizon: Horizon, task: Task, i: int, body: Array) -> Array:
+    """Places of the body (H, parts + 1, nodes, d) as an obstacle sees them, that moves from where the scene puts it."""
+    return np.asarray(body - task.shifts(i, _times(horizon, len(body)))[:, :, None])
 
 
 def _cheapest(horizon: Horizon, task: Task, level: float) -> Plan:
     """All sides of the obstacles on the way."""
     free = places(horizon, task, np.zeros(horizon.plant.n_s * horizon.steps))
-    first = [_normals(shape, free) for shape in task.shapes]
+    seen = [_off(horizon, task, i, free) for i in range(len(task.shapes))]
+    first = [_normals(shape, body) for shape, body in zip(task.shapes, seen, strict=True)]
     moving = [i for i, shape in enumerate(task.shapes) if not isinstance(shape, HalfSpace)]
-    on_way = [i for i in moving if _left(task.shapes[i], task, first[i], free).min() < 0]
-    way, still = free[:, 0].mean(axis=1), task.places - task.places.mean(axis=0)
-    ways = list(product((1, -1), repeat=len(on_way)))
+    on_way = [i for i in moving if _left(task.shapes[i], task, first[i], seen[i]).min() < 0]
+    still, d = task.places - task.places.mean(axis=0), task.places.shape[1]
+    ways = list(product((1, -1, 2, -2)[: 2 * (d - 1)], repeat=len(on_way)))
     plans: list[Plan] = []
     for sides in ways[:MOST_WAYS]:
         normals = list(first)
         for i, side in zip(on_way, sides, strict=True):
-            normals[i] = past(task.shapes[i], way, still, side)
-        plans.append(_rounds(horizon, task, np.array(normals).reshape(-1, horizon.steps, 2), level, sides))
+            normals[i] = past(task.shapes[i], seen[i][:, 0].mean(axis=1), still, side)
+        plans.append(_rounds(horizon, task, np.array(normals).reshape(-1, horizon.steps, d), level, sides))
     best = min(plans, key=lambda p: (p.depth > 0, p.depth if p.depth > 0 else float(p.c @ p.c)))
     tried = tuple((p.sides, float(p.c @ p.c), p.depth) for p in plans)
     return replace(best, tried=tried, untried=len(ways) - len(plans))
@@ -225,8 +301,8 @@ def _left(shape: Shape, task: Task, normals: Array, body: Array) -> Array:
 
 
 def _normals(shape: Shape, body: Array) -> Array:
-    """Of the half-planes that keep the body of every interval farthest off, (H, 2)."""
-    return np.array([separate(shape, at.reshape(-1, 2))[0] for at in body])
+    """Of the half-spaces that keep the body of every interval farthest off, (H, d)."""
+    return np.array([separate(shape, at.reshape(-1, at.shape[-1]))[0] for at in body])
 
 
 def _rounds(horizon: Horizon, task: Task, normals: Array, level: float, sides: tuple[int, ...]) -> Plan:
@@ -245,10 +321,13 @@ def _rounds(horizon: Horizon, task: Task, normals: Array, level: float, sides: t
         plan = replace(plan, active=active, sides=sides)
         if best is None or _better(plan, best):
             best = plan
+        elif best.gap >= 0 and plan.gap >= 0:  # other half-spaces, and no gain
+            break
         if len(costs) > 1 and abs(costs[-1] - costs[-2]) <= SETTLED * costs[-1] and (plan.gap >= 0 or plan.depth > 0):
             break
         body = plan.body()
-        normals = np.array([_normals(s, body) for s in task.shapes]).reshape(-1, horizon.steps, 2)
+        normals = np.array([_normals(s, _off(horizon, task, i, body)) for i, s in enumerate(task.shapes)])
+        normals = normals.reshape(-1, horizon.steps, body.shape[-1])
     assert best is not None
     return replace(best, costs=tuple(costs), steps=steps)
 
@@ -280,9 +359,11 @@ def _rows(horizon: Horizon, task: Task, normals: Array, c: Array) -> tuple[Array
     """Rows of all obstacles with room for the bends of the plan c, and the group of each: its obstacle and interval."""
     rows, right = [np.zeros((0, len(c)))], [np.zeros(0)]
     x, u = horizon.state(task.start, c), horizon.input(task.start, c)
-    for shape, n in zip(task.shapes, normals, strict=True):
-        margin = ROOM * both_ends(bends(horizon.plant, x, u, n))
-        G, h = gap_rows(horizon, task.start, n, _free(shape, task, n)[:, None] - margin)
+    rounding = ROUNDING * float(np.ptp(task.places, axis=0).max())  # so that no gap of the plan is below zero by it
+    for i, (shape, n) in enumerate(zip(task.shapes, normals, strict=True)):
+        margin = ROOM * both_ends(bends(horizon.plant, x, u, n, _turns(horizon, task, i, n)))
+        moved = np.einsum("kd,kid->ki", n, task.shifts(i, _times(horizon)))[:, :, None]
+        G, h = gap_rows(horizon, task.start, n, _free(shape, task, n)[:, None] - moved - margin - rounding)
         rows.append(G)
         right.append(h)
     h = np.concatenate(right)
@@ -322,10 +403,14 @@ def _judged(
     if len(u) - H == MOST_FOLLOWED:
         unsafe[-1] = True
     gap, bend = np.inf, 0.0
-    for shape, ahead, (normal, _) in zip(task.shapes, normals, _at_target(task), strict=True):
+    target = _at_target(task, H * plant.grid)
+    for i, (shape, ahead, (normal, _)) in enumerate(zip(task.shapes, normals, target, strict=True)):
         n = np.concatenate([ahead, np.tile(normal, (len(u) - H, 1))])
-        own = both_ends(bends(plant, x, u, n))
-        left = _left(shape, task, n, body) - own
+        turns = _turns(horizon, task, i, n)
+        if len(u) > H and not isinstance(turns, float):
+            turns[H:] = 0.0  # it rests, or goes away along a line
+        own = both_ends(bends(plant, x, u, n, turns))
+        left = _left(shape, task, n, _off(horizon, task, i, body)) - own
         gap = min(gap, float(left.min()))
         unsafe |= (left < 0).any(axis=(1, 2))
         holds = left[:H] <= (ROOM - 1) * own[:H] + TIGHT * float(np.ptp(task.places))

@@ -30,7 +30,7 @@ def gap_rows(horizon: Horizon, start: Array, normals: Array, free: Array) -> tup
 
     Args:
         start: x_0, (N,).
-        normals: unit normal of each interval, (H, 2).
+        normals: unit normal of each interval, (H, d).
         free: how far each node may move against the normal from its place at the target, (H, parts + 1, nodes).
 
     Returns rows and right-hand side, (H (parts + 1) nodes, n_s H) and (H (parts + 1) nodes,).
@@ -75,17 +75,19 @@ def swings(plant: HeldPlant) -> tuple[Array, Array]:
     return T, W
 
 
-def bends(plant: HeldPlant, states: Array, inputs: Array, normals: Array) -> Array:
+def bends(plant: HeldPlant, states: Array, inputs: Array, normals: Array, turns: Array | float = 0.0) -> Array:
     """Bound on what a node goes below the chord between two instants, (H, parts, nodes) [m].
 
-    ``states``: at all instants, (H, parts + 1, N); ``inputs``: (H, n_s); ``normals``: (H, 2).
+    ``states``: at all instants, (H, parts + 1, N); ``inputs``: (H, n_s); ``normals``: (H, d); ``turns``: bound on the
+    acceleration of the obstacle along them, (H, parts) [m/s2].
     """
     T, W = swings(plant)
     moving = np.einsum("men,kin->kime", T, states[:, :-1]) + np.einsum("mes,ks->kme", W, inputs)[:, None]
     seen = np.abs(np.einsum("kd,jdm->kjm", normals, plant.tissue.seen))
     tissue = np.einsum("kjm,kim->kij", seen, np.linalg.norm(moving, axis=-1) * _pace(plant))
     along = np.einsum("kd,ks,ds->k", normals, inputs, plant.B[plant.n_s : 2 * plant.n_s])
-    return np.asarray((plant.grid / plant.parts) ** 2 / 8 * np.maximum(tissue + along[:, None, None], 0.0))
+    rigid = (along[:, None] + turns)[:, :, None]
+    return np.asarray((plant.grid / plant.parts) ** 2 / 8 * np.maximum(tissue + rigid, 0.0))
 
 
 def _pace(plant: HeldPlant) -> Array:
@@ -106,7 +108,7 @@ def tail_level(plant: HeldPlant, gaps: list[tuple[Array, Array]], limits: Limits
     for the bends between them.
 
     Args:
-        gaps: normal (2,) and free way of every node against it at the target, (nodes,), of each obstacle.
+        gaps: normal (d,) and free way of every node against it at the target, (nodes,), of each obstacle.
         u_bar: steady input [N], (n_s,).
 
     Negative where the target itself violates a gap or a limit.

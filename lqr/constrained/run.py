@@ -10,7 +10,6 @@ import scipy.linalg
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.constrained.plan import Plan
-from softgrasp.lqr.constrained.separation import separate
 from softgrasp.lqr.constrained.tissue import ModalTissue, Surface
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import predicted_cost
@@ -28,7 +27,7 @@ class BodyRun:
     """The body in a run of the full plant."""
 
     times: Array  # [s], (steps + 1,)
-    body: Array  # places of the nodes on the boundary [m], (steps + 1, nodes, 2)
+    body: Array  # places of the nodes on the boundary [m], (steps + 1, nodes, d)
     inputs: Array  # [N], (steps, n_s)
     v_s: Array  # velocity of the hand [m/s], (steps + 1, n_s)
     gaps: Array  # distance of body and obstacle, negative where they overlap [m], (steps + 1, obstacles)
@@ -117,7 +116,7 @@ def run_plan(
     )
     at = (np.arange(len(inputs))[:, None] * each + np.arange(plant.parts + 1) * STEPS).ravel()
     hand, places = runs[0].q_s[at][:, None], plan.task.places - target.state.q_s
-    off = planned.body[at] - (places + hand) - exact.reshape(len(at), -1, 2)
+    off = planned.body[at] - (places + hand) - exact.reshape(len(at), *places.shape)
     return PlanRuns(planned, free, dt, _largest(exact - reduced), _largest(off))
 
 
@@ -174,13 +173,9 @@ def body_run(
 ) -> BodyRun:
     """Places, gaps and cost of a run of the watched plant. Collective."""
     moved = run.outputs[:, len(problem.Q) :].reshape(len(run.times), -1, problem.layout.dimension)
-    held = np.repeat(run.q_s[:, None, :2], len(surface.nodes) - surface.free, axis=1)
+    held = np.repeat(run.q_s[:, None, : problem.layout.dimension], len(surface.nodes) - surface.free, axis=1)
     body = surface.nodes + np.concatenate([moved, held], axis=1)
 
-    def gaps() -> Array:
-        every = [[separate(shape, at)[1] for shape in plan.task.shapes] for at in body]
-        return np.array(every).reshape(len(body), -1)
-
     to_come = predicted_cost(problem, solution, run.final - target.state)
-    apart = on_root(problem.layout.comm, gaps)
+    apart = on_root(problem.layout.comm, lambda: plan.task.gaps(body, run.times))
     return BodyRun(run.times, body, run.inputs, run.v_s, apart, float(run.cost[-1]) + to_come)

@@ -1,8 +1,10 @@
-"""How far a body stands off a convex obstacle in the plane, and the half-plane between them.
+"""How far a body stands off a convex obstacle, and the half-space between them.
 
 The gap of the convex hulls is max over unit n of min_j n.y_j - h(n), h the support of the obstacle; it is attained at
 the normal of a side of either, or along the line between two corners. Where they overlap it is minus the shortest way
-out.
+out. In space the hulls have too many pairs of sides to look at: n is the solution of the program of least distance
+min |w|^2 / 2, w.(y_j - o_k) >= 1 over all pairs of corners, n = w / |w|, and where it has none a face of the hull of
+the differences.
 """
 
 from __future__ import annotations
@@ -12,6 +14,10 @@ import scipy.spatial
 
 from softgrasp.fem.obstacles.shapes import Ball, HalfSpace, Polytope, Shape
 from softgrasp.fem.petsc import Array
+from softgrasp.lqr.program.least_distance import InfeasibleError, nearest
+
+UPRIGHT = 1e-6  # sine of the angle from the vertical below which a way is vertical
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def supports(shape: Shape, normals: Array) -> Array:
@@ -24,11 +30,19 @@ def supports(shape: Shape, normals: Array) -> Array:
 
 
 def separate(shape: Shape, body: Array) -> tuple[Array, float]:
-    """The half-plane n.x >= h(n) that keeps a body (b, 2) farthest off an obstacle: n, (2,), and the gap [m]."""
+    """The half-space n.x >= h(n) that keeps a body (b, d) farthest off an obstacle: n, (d,), and the gap [m]."""
     if isinstance(shape, HalfSpace):
         return shape.normal, float((body @ shape.normal).min() - shape.offset)
     assert isinstance(shape, Ball | Polytope)
     corners = shape.corners if isinstance(shape, Polytope) else shape.center[None, :]
+    if body.shape[1] == 2 and len(body) > 2:
+        return _separate_plane(shape, corners, body)
+    normal = _apart((body[:, None] - corners).reshape(-1, body.shape[1]))
+    return normal, float((body @ normal).min() - supports(shape, normal[None])[0])
+
+
+def _separate_plane(shape: Ball | Polytope, corners: Array, body: Array) -> tuple[Array, float]:
+    """Of three points and more in the plane."""
     hull = body[scipy.spatial.ConvexHull(body).vertices]
     sides = np.roll(hull, -1, axis=0) - hull
     normals = [np.column_stack([-sides[:, 1], sides[:, 0]])]  # inwards: hulls turn to the left
@@ -43,21 +57,47 @@ def separate(shape: Shape, body: Array) -> tuple[Array, float]:
     return every[best], float(gaps[best])
 
 
+def _apart(points: Array) -> Array:
+    """The unit vector n with the largest min_p n.p, (d,)."""
+    size = float(np.abs(points).max())
+    try:
+        w = nearest(-points / size, np.full(len(points), -1.0)).x
+    except InfeasibleError:  # the origin is inside: the nearest face of the hull
+        try:
+            faces = scipy.spatial.ConvexHull(points).equations
+        except scipy.spatial.QhullError:  # fewer than d + 1 points, or flat: across what they span
+            return np.asarray(np.linalg.svd(points - points[0])[2][-1])
+        return np.asarray(-faces[int(np.argmax(faces[:, -1])), :-1])
+    return np.asarray(w / np.linalg.norm(w))
+
+
 def past(shape: Shape, way: Array, body: Array, side: int) -> Array:
     """Normals that turn from behind an obstacle over one side to its front, as the body goes along its way.
 
     Args:
-        way: displacement of the body in every interval, (H, 2).
-        body: nodes of the undisplaced body, (b, 2).
-        side: 1 passes the obstacle on the left of the way, -1 on the right.
+        way: displacement of the body from the obstacle in every interval, (H, d).
+        body: nodes of the undisplaced body, (b, d).
+        side: 1 passes the obstacle on the left of the way, -1 on the right; in space 2 above and -2 below it.
 
-    Returns unit normals, (H, 2).
+    Returns unit normals, (H, d).
     """
     along = way[-1] - way[0]
-    along = along / np.linalg.norm(along)
-    across = side * np.array([-along[1], along[0]])
+    length = float(np.linalg.norm(along))
+    along = along / length if length > 0 else np.eye(way.shape[1])[0]
+    across = np.sign(side) * _across(along)[abs(side) - 1]
     both = np.vstack([along, -along])
     ahead, behind = supports(shape, both)
     reach = (ahead + behind) / 2 + np.ptp(body @ along) / 2
     progress = np.clip(((way + body.mean(axis=0)) @ along - (ahead - behind) / 2) / reach, -1, 1)
     return np.asarray(progress[:, None] * along + np.sqrt(1 - progress[:, None] ** 2) * across)
+
+
+def _across(along: Array) -> list[Array]:
+    """Left of a direction, and in space above it."""
+    if len(along) == 2:
+        return [np.array([-along[1], along[0]])]
+    left = np.cross(UP, along)
+    if np.linalg.norm(left) < UPRIGHT:
+        left = np.cross(np.array([0.0, 1.0, 0.0]), along)  # of a way straight up or down, -x or x
+    left = left / np.linalg.norm(left)
+    return [left, np.cross(along, left)]

@@ -145,8 +145,8 @@ def require_plannable(problem: RiccatiProblem) -> None:
 def _not_planned(problem: RiccatiProblem) -> str:
     """What a plan needs and this plant has not; empty where it has all."""
     system, layout = problem.system, problem.layout
-    if layout.dimension != 2 or layout.order != 1:
-        return f"2D elements of order 1, whose edges stay straight; this scene has {layout.dimension}D, P{layout.order}"
+    if layout.order != 1:
+        return f"elements of order 1, whose edges stay straight; this scene has order {layout.order}"
     if system.two_way or layout.n_s != layout.dimension:
         return "a hand that neither turns nor feels the tissue; set effects.reaction and effects.rotation to false"
     if system.points is not None:

@@ -12,7 +12,7 @@ import scipy.linalg
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.obstacles import Obstacle, make_obstacles
+from softgrasp.fem.obstacles import make_obstacles
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.constrained.horizon import held_plant
 from softgrasp.lqr.constrained.online import Ticks, carried_ticks, make_program
@@ -20,7 +20,6 @@ from softgrasp.lqr.constrained.plan import Plan, Task, make_plan
 from softgrasp.lqr.constrained.pulse import PulseError
 from softgrasp.lqr.constrained.rows import Limits
 from softgrasp.lqr.constrained.run import STEPS, PlanRuns, run_inputs, run_plan
-from softgrasp.lqr.constrained.separation import separate
 from softgrasp.lqr.constrained.tissue import ModalTissue, Surface, make_surface, modal_tissue, require_plannable
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.linearise import finite_problem
@@ -144,7 +143,8 @@ def plan_control(
         ResourceError: the quadratic program does not fit in memory.
         SolverError: a solve of the full plant failed.
     """
-    plant, obstacles = design.problem, fixed_obstacles(design.model)
+    plant = design.problem
+    obstacles = make_obstacles(design.model.scene, plant.layout.dimension)
     given = control_of(design.model).constraints
     assert given is not None
     surface = _surface(design.model)
@@ -170,7 +170,7 @@ def plan_control(
         target = _places(plant, surface, design)
         task = Task(
             begin, target, design.target.u, shapes, names, error, given.clearance + estimated, limits, noise,
-            given.margin == "bound", penalty,
+            given.margin == "bound", penalty, tuple(o.path for o in obstacles),
         )  # fmt: skip
         steps = first_horizon(design.model, plant)
         longest = None if given.horizon == "auto" else steps
@@ -288,34 +288,20 @@ def _online(
         every = max(1, program.every // (plant.parts * STEPS))
         count = plan.horizon.steps * program.every
         found = run_tube(runs, ticks, rows, count, every, None if observed is None else 0)
-        gaps = [[separate(shape, plan.task.places + moved)[1] for shape in plan.task.shapes] for moved in found.moved]
+        gaps = plan.task.gaps(plan.task.places + found.moved, found.times)
         covariance = None if observed is None else node_covariance(rows, observed.judged)
-        return PlannedOnline(
-            controller, covariance, found.times, np.array(gaps).reshape(len(found.times), -1), found.log
-        )
+        return PlannedOnline(controller, covariance, found.times, gaps, found.log)
 
     return on_root(problem.layout.comm, run), ""
 
 
 def require_plan(model: Model) -> None:
     """Raises ControlError: the scene has no plan, whatever its gain. Collective."""
-    fixed_obstacles(model)
     plant = problem(model)
     require_plannable(plant)
     _given_force(model, plant.layout.n_s)
     if model.system.gravity is not None and model.scene.time.start != "equilibrium":
         raise ControlError(SWINGS)
-
-
-def fixed_obstacles(model: Model) -> tuple[Obstacle, ...]:
-    """The obstacles of a scene. Raises ControlError: one of them moves."""
-    obstacles = make_obstacles(model.scene, model.system.layout.dimension)
-    for i, obstacle in enumerate(obstacles):
-        if obstacle.path is not None:
-            raise ControlError(
-                f"obstacle.{i}.path moves obstacle {obstacle.name}; a plan needs obstacles that are fixed"
-            )
-    return obstacles
 
 
 def first_horizon(model: Model, plant: RiccatiProblem) -> int:
@@ -339,7 +325,7 @@ def plan_sizes(model: Model) -> PlanSizes | None:
         return None
     plant = problem(model)
     steps, n_s = first_horizon(model, plant), plant.layout.n_s
-    gaps = len(fixed_obstacles(model)) * (given.parts + 1) * len(_surface(model).nodes)
+    gaps = len(model.scene.obstacle or []) * (given.parts + 1) * len(_surface(model).nodes)
     hand = 2 * n_s * sum(limit is not None for limit in (given.force, given.speed, given.jump))
     return PlanSizes(given.N, steps, given.grid, n_s * steps, steps * (gaps + hand))
 

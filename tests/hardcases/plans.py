@@ -55,7 +55,9 @@ PLANS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("target that touches", ("obstacle=[{kind='halfspace', normal=[-1, 0], offset=-6.0}]",), None),
     ("target inside", ("obstacle=[{kind='halfspace', normal=[-1, 0], offset=-5.9}]",), None),
     ("disc over the start, 0.1 m deep", ("obstacle=[{kind='disc', center=[-0.6, 1.0], radius=0.7}]",), 0.101),
-    ("disc that moves", ("obstacle=[{kind='disc', center=[3.4, 1.2], radius=0.7, path={velocity=[0.1, 0]}}]",), None),
+    ("disc that moves", ("obstacle=[{kind='disc', center=[3.4, 1.2], radius=0.7, path={velocity=[0.1, 0]}}]",), 0.0),
+    ("disc that moves on to the target", (
+        "obstacle=[{kind='disc', center=[3.4, 1.2], radius=0.7, path={velocity=[0.01, 0.01]}}]",), None),
     ("Q = 1e6", (f"obstacle=[{WALL}]", "control.Q=1e6", "control.constraints.force=60.0",
                  "control.constraints.grid=0.1", "control.constraints.speed=20.0"), 0.0),
     ("beta = 2e-4", (f"obstacle=[{WALL}]", "effects.damping={kind='kelvin-voigt', beta=2e-4}"), 0.0),

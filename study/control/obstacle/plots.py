@@ -10,17 +10,18 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from softgrasp.fem import AXES, PictureMesh
-from softgrasp.fem.obstacles.shapes import Shape
+from softgrasp.fem.obstacles.shapes import Ball, HalfSpace, Polytope, Shape
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr import PlannedControl, separate
+from softgrasp.lqr import PlannedControl, Task
 from softgrasp.study.control.obstacle.result import PlannedStudy
 from softgrasp.study.pictures import draw_obstacle, style
 
 SHOWN = (0.0, 0.12, 0.28, 0.45, 0.62, 0.8, 1.0)  # shares of the way at which the body is drawn
 MANY = 2000  # points of a line; in print more of them coincide
+APART = 0.08  # of the picture, between two names of an obstacle that moves
 HALO = [withStroke(linewidth=2.5, foreground="white")]  # keeps times readable on lines
 LIMIT: dict[str, Any] = {"color": "#999999", "lw": 0.8, "ls": (0, (4, 2))}
 
@@ -31,7 +32,8 @@ def draw_plan(study: PlannedStudy, picture: PictureMesh | None, out: Path) -> li
     if np.isfinite(study.seconds_cold).all():
         files += figure_times(study, out / "times.png")
     if picture is not None:
-        files += figure_bodies(study.planned, picture, out / "obstacle.png")
+        draw = figure_bodies if picture.dimension == 2 else figure_views
+        files += draw(study.planned, picture, out / "obstacle.png")
     return files
 
 
@@ -39,9 +41,7 @@ def figure_bodies(planned: PlannedControl, picture: PictureMesh, out_png: Path) 
     """The boundary of the body at some instants under the plan and under the optimal feedback; PNG and PDF."""
     runs, nodes = planned.runs, planned.surface.nodes
     edges = cKDTree(nodes).query(picture.points[picture.facets])[1]
-    centre = runs.planned.body.mean(axis=1)
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centre, axis=0), axis=1))])
-    instants = [int(np.searchsorted(way, share * way[-1])) for share in SHOWN]
+    centre, instants = _shown(runs.planned.body)
     lines, free = runs.planned.body, runs.free.body
     low, high = lines.min(axis=(0, 1)), lines.max(axis=(0, 1))
     room = 0.06 * (high - low).max()
@@ -49,8 +49,8 @@ def figure_bodies(planned: PlannedControl, picture: PictureMesh, out_png: Path) 
     with style.paper_style():
         width = style.WIDTH
         figure, ax = plt.subplots(figsize=(width, width * (box[1, 1] - box[0, 1]) / (box[1, 0] - box[0, 0])))
-        for shape, name in zip(planned.plan.task.shapes, planned.names, strict=True):
-            draw_obstacle(ax, shape, name, box)
+        for i in range(len(planned.names)):
+            _draw(ax, planned, i, runs.planned.times[instants], (0, 1), box)
         worst = [int(runs.free.gaps[:, i].argmin()) for i in range(len(planned.names))]
         for n in sorted(set(worst)):
             ax.add_collection(
@@ -75,6 +75,83 @@ def figure_bodies(planned: PlannedControl, picture: PictureMesh, out_png: Path) 
         return style.save(figure, out_png)
 
 
+def figure_views(planned: PlannedControl, picture: PictureMesh, out_png: Path) -> tuple[Path, ...]:
+    """Outlines of a body in space at some instants under the plan, from the front and from above; PNG and PDF."""
+    run = planned.runs.planned
+    centre, instants = _shown(run.body)
+    low, high = run.body.min(axis=(0, 1)), run.body.max(axis=(0, 1))
+    room = 0.1 * (high - low).max()
+    box = np.array([low - room, high + room])
+    colours = style.colour_map()(np.linspace(0.15, 1.0, len(instants)))
+    with style.paper_style():
+        size = np.ptp(box, axis=0)
+        height = style.WIDTH * (size[1] + size[2]) / size[0]
+        figure, views = plt.subplots(
+            2, 1, figsize=(style.WIDTH, 1.1 * height), sharex=True, layout="constrained",
+            gridspec_kw={"height_ratios": [size[2], size[1]]},
+        )  # fmt: skip
+        for ax, plane in zip(views, ((0, 2), (0, 1)), strict=True):
+            for i in range(len(planned.names)):
+                _draw(ax, planned, i, run.times[instants], plane, box[:, plane])
+            for colour, n in zip(colours, instants, strict=True):
+                seen = run.body[n][:, plane]
+                around = seen[ConvexHull(seen).vertices]
+                ax.plot(*np.vstack([around, around[:1]]).T, color=colour, lw=1.3, zorder=3)
+                x, y = centre[n][list(plane)]
+                ax.text(
+                    x, y, f"{run.times[n]:.3g} s", ha="center", va="center", fontsize=7, zorder=4, path_effects=HALO
+                )
+            ax.plot(*centre[:, plane].T, color=style.HAND, lw=0.7, ls=(0, (1, 1.2)), zorder=2)
+            ax.set(xlim=box[:, plane[0]], ylim=box[:, plane[1]], aspect="equal", ylabel=f"${AXES[plane[1]]}$ [m]")
+        views[-1].set_xlabel("$x$ [m]")
+        return style.save(figure, out_png)
+
+
+def _shown(body: Array) -> tuple[Array, list[int]]:
+    """The middle of the body (times, nodes, d) over time, and the instants that are drawn."""
+    centre = body.mean(axis=1)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centre, axis=0), axis=1))])
+    return centre, [int(np.searchsorted(way, share * way[-1])) for share in SHOWN]
+
+
+def _draw(ax: Any, planned: PlannedControl, i: int, times: Array, plane: tuple[int, int], box: Array) -> None:
+    """An obstacle seen along the third axis; one that moves at some instants."""
+    task, axes = planned.plan.task, list(plane)
+    shape = _seen(task.shapes[i], axes)
+    if shape is None:
+        return
+    moves = task.path(i) is not None
+    shifts = task.shifts(i, times if moves else times[:1])[:, axes]
+    named = -1  # where the last name is
+    for k, (t, shift) in enumerate(zip(times.tolist(), shifts, strict=False)):
+        far = named < 0 or np.linalg.norm(shift - shifts[named]) > APART * np.ptp(box, axis=0).max()
+        name = (f"{planned.names[i]} {t:.3g} s" if np.ptp(shifts, axis=0).any() else planned.names[i]) if far else ""
+        named = k if far else named
+        if _inside(shape, shift, box):
+            draw_obstacle(ax, shape, name, box, shift)
+
+
+def _inside(shape: Shape, shift: Array, box: Array) -> bool:
+    """Whether the middle of an obstacle lies in the picture; of a half-space always."""
+    if isinstance(shape, HalfSpace):
+        return True
+    assert isinstance(shape, Ball | Polytope)
+    middle = shape.center if isinstance(shape, Ball) else shape.corners.mean(axis=0)
+    size = np.ptp(shape.corners, axis=0) / 2 if isinstance(shape, Polytope) else shape.radius
+    return bool((np.abs(middle + shift - box.mean(axis=0)) < np.ptp(box, axis=0) / 2 + size).all())
+
+
+def _seen(shape: Shape, axes: list[int]) -> Shape | None:
+    """An obstacle seen along an axis; None for a half-space whose face is not parallel to it."""
+    if isinstance(shape, Ball):
+        return Ball(shape.center[axes], shape.radius)
+    if isinstance(shape, Polytope):
+        return Polytope.hull(shape.corners[:, axes])
+    assert isinstance(shape, HalfSpace)
+    normal = shape.normal[axes]
+    return HalfSpace(normal, shape.offset) if np.linalg.norm(normal) > 1 - 1e-9 else None
+
+
 def figure_times(study: PlannedStudy, out_png: Path) -> tuple[Path, ...]:
     """Histogram of the times of the quadratic program against tick and interval; PNG and PDF."""
     kinds = {"without a guess": study.seconds_cold, "from a plan nearby": study.seconds_warm}
@@ -97,9 +174,9 @@ def figure_times(study: PlannedStudy, out_png: Path) -> tuple[Path, ...]:
         return style.save(figure, out_png)
 
 
-def _deviation(covariance: Array, shape: Shape, body: Array) -> Array:
+def _deviation(covariance: Array, task: Task, i: int, body: Array, times: Array) -> Array:
     """Standard deviation of the gap, that of the nearest node along its normal [m], (times,)."""
-    normals = np.array([separate(shape, at)[0] for at in body])
+    normals = np.array([task.separate(i, at, t)[0] for at, t in zip(body, times.tolist(), strict=True)])
     nearest = np.einsum("td,tjd->tj", normals, body).argmin(axis=1)
     return np.asarray(np.sqrt(np.einsum("td,tde,te->t", normals, covariance[nearest], normals)))
 
@@ -116,7 +193,7 @@ def figure_gaps(planned: PlannedControl, out_png: Path) -> tuple[Path, ...]:
         for i, name in enumerate(planned.names):
             gaps.plot(run.times[thin], run.gaps[thin, i], color=style.CYCLE[i % 4], label=name)
             if planned.online is not None and planned.online.covariance is not None:
-                room = 3 * _deviation(planned.online.covariance, task.shapes[i], run.body[thin])
+                room = 3 * _deviation(planned.online.covariance, task, i, run.body[thin], run.times[thin])
                 low, high = run.gaps[thin, i] - room, run.gaps[thin, i] + room
                 gaps.fill_between(run.times[thin], low, high, color=style.CYCLE[i % 4], alpha=0.25, lw=0)
         if run.gaps.min(initial=1.0) > 0:

@@ -16,7 +16,9 @@ from softgrasp.study.report import Section, Table, captioned, in_words, percent
 
 CAPTIONS = {
     "obstacle.png": "The boundary of the body on the full plant under the plan, and the way of its middle; grey and "
-    "dashed: under the optimal feedback, which has no obstacles, where it is deepest inside.",
+    "dashed: under the optimal feedback, which has no obstacles, where it is deepest inside. A body in space is seen "
+    "from the front and from above, where outlines may cross and nothing touches. What moves is drawn at the same "
+    "instants.",
     "gaps.png": "Gap of the body to every obstacle on the full plant, with a band of three standard deviations where "
     "an observer keeps it on its way under noise. Dashed: clearance and margins, which the reduced plant keeps; the "
     "full plant may use the margins up. Below: force and speed of the hand with their limits.",
@@ -165,7 +167,7 @@ def _held(plan: Plan) -> str:
 
 def words(sides: Sequence[int]) -> str:
     """On which sides the obstacles on the way are passed."""
-    return ", ".join("left" if side > 0 else "right" for side in sides)
+    return ", ".join({1: "left", -1: "right", 2: "above", -2: "below"}[side] for side in sides)
 
 
 def _cost(cost: float, depth: float) -> str:

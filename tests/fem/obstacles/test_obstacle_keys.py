@@ -97,6 +97,6 @@ def test_the_file_of_a_path_counts_in_the_hash_and_is_named_absolutely(moved: Sc
     assert before == scene_hash(moved)
     (tmp_path / "table.csv").write_text("t,x,y\n0,0,0\n3,0,1\n")
     assert scene_hash(again) != before
-    (tmp_path / "table.csv").write_text("t,x,y\n0,0,0\n2,0,1\n")
-    with pytest.raises(SceneError, match=r"obstacle.0.path.csv: .*table.csv covers 0 to 2 s, the run needs 0 to 3 s"):
+    (tmp_path / "table.csv").write_text("t,x,y\n1,0,0\n2,0,1\n")
+    with pytest.raises(SceneError, match=r"obstacle.0.path.csv: the times in .*table.csv must begin at 0, not at 1 s"):
         make_obstacles(again, 2)

@@ -198,6 +198,7 @@ def test_shipped_scene_loads_and_survives_its_resolved_text(name: str, tmp_path:
 def test_scenes_that_checks_name_are_shipped() -> None:
     wanted = {"paper_forward", "paper_lqr", "paper_lqr_undamped", "franka_muscle", "block_3d", "pillow_3d", "layers_2d"}
     wanted |= {"paper_accurate", "paper_obstacle", "set_down", "push_disc", "set_down_3d", "turn_over", "turn_over_3d"}
+    wanted |= {"reach_over_3d"}
     assert wanted <= SCENES.keys()
     assert PILLOW.parent.joinpath("meshes", "pillow_small.LICENSE").is_file()
 

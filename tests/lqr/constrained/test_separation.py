@@ -41,3 +41,43 @@ def test_normals_turn_over_the_side_that_is_asked_for() -> None:
     left, right = past(shape, way, body, 1), past(shape, way, body, -1)
     assert np.allclose(left[0], [-1, 0]) and np.allclose(left[-1], [1, 0])  # noqa: PT018
     assert np.allclose(left[10], [0, 1]) and np.allclose(right[10], [0, -1])  # noqa: PT018
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [Ball(np.array([0.3, 0.2, 0.1]), 0.4), Polytope.box(np.zeros(3), np.array([0.5, 1.0, 0.7])),
+     Polytope.hull(np.array([[0.0, 0, 0], [1.0, 0.2, 0.1], [0.3, 0.9, 0.2], [0.2, 0.3, 1.0]]))],
+)  # fmt: skip
+def test_gap_in_space_is_the_best_of_all_directions(shape: Shape) -> None:
+    rng = np.random.default_rng(0)
+    fan = rng.standard_normal((20_000, 3))
+    fan /= np.linalg.norm(fan, axis=1)[:, None]
+    overlap = 0
+    for _ in range(30):
+        body = rng.uniform(-1.2, 1.2, 3) + 0.5 * rng.standard_normal((9, 3))
+        normal, gap = separate(shape, body)
+        scanned = ((fan @ body.T).min(axis=1) - supports(shape, fan)).max()
+        assert scanned <= gap + 1e-12  # rounding
+        assert gap <= scanned + 0.08  # directions are some 0.03 rad apart, points up to 3 m
+        assert np.isclose((body @ normal).min() - shape.support(normal), gap, atol=1e-12)
+        overlap += gap < 0
+    assert 3 < overlap < 27  # both cases are met
+
+
+def test_boxes_are_apart_by_the_distance_of_their_corners() -> None:
+    body = Polytope.box(np.array([1.3, 1.4, 0.5]), np.array([2.0, 2.0, 2.0])).corners
+    normal, gap = separate(Polytope.box(np.zeros(3), np.ones(3)), body)
+    assert np.allclose(normal, [0.6, 0.8, 0.0], atol=1e-12)
+    assert gap == pytest.approx(0.5, rel=1e-12)  # of a 3, 4, 5 triangle
+    _, deep = separate(Polytope.box(np.zeros(3), np.ones(3)), body - [0.4, 0.5, 0.25])
+    assert deep == pytest.approx(-0.1, rel=1e-12)  # out through the nearest face
+    assert separate(Ball(np.zeros(3), 0.25), np.array([[0.0, 3.0, 4.0]]))[1] == pytest.approx(4.75, rel=1e-12)
+
+
+def test_in_space_an_obstacle_is_passed_on_four_sides() -> None:
+    way = np.linspace([0.0, 0.0, 0.0], [10.0, 0.0, 0.0], 21)
+    body = Polytope.box(np.full(3, -0.5), np.full(3, 0.5)).corners
+    shape = Ball(np.array([5.0, 0.0, 0.0]), 1.0)
+    for side, across in ((1, [0, 1, 0]), (-1, [0, -1, 0]), (2, [0, 0, 1]), (-2, [0, 0, -1])):
+        normals = past(shape, way, body, side)
+        assert np.allclose(normals[[0, 10, 20]], [[-1, 0, 0], across, [1, 0, 0]])

@@ -108,7 +108,7 @@ def test_error_of_the_linear_plant_becomes_a_margin_on_request(tmp_path: Path) -
         ("control.constraints.force=[1.0, 1.0, 1.0]", "force has 3 numbers; give one, or 2, one per axis"),
         ("control.loop.limit=2.0", "control.loop.limit cuts the forces at 2 N"),
         ("obstacle.1.offset=-5.99", "at the target the gap to obstacle wall is -0.01 m"),
-        ("obstacle.0.path={velocity=[0.1, 0.0]}", "obstacle.0.path moves obstacle disc"),
+        ("obstacle.0.path={velocity=[0.01, 0.01]}", "obstacle disc moves towards the body at the target until the end"),
         ("effects.reaction=true", "a plan past obstacles is made for a hand that neither turns nor feels the tissue"),
         ("effects.gravity=[0, -0.1]", "a plan starts with the tissue in equilibrium"),
         ("control.constraints.horizon=1e9", "a plan of 1e+09 intervals would take about"),
