@@ -110,13 +110,13 @@ def run_plan(
         loop.destroy()
     planned, free = (body_run(problem, solution, plan, surface, run, target) for run in runs)
     acceleration = (inputs - target.u) @ plant.B[plant.n_s : 2 * plant.n_s].T
-    exact, reduced = (
-        np.einsum("jdm,kim->kijd", t.seen, t.answer(acceleration, plant.grid, plant.parts))
-        for t in (tissue, plant.tissue)
+    exact, reduced, off_hand = (
+        np.einsum("jdm,kim->kijd", seen, t.answer(acceleration, plant.grid, plant.parts))
+        for t, seen in ((tissue, tissue.seen), (plant.tissue, plant.tissue.seen), (tissue, tissue.relative))
     )
     at = (np.arange(len(inputs))[:, None] * each + np.arange(plant.parts + 1) * STEPS).ravel()
     hand, places = runs[0].q_s[at][:, None], plan.task.places - target.state.q_s
-    off = planned.body[at] - (places + hand) - exact.reshape(len(at), *places.shape)
+    off = planned.body[at] - (places + hand) - off_hand.reshape(len(at), *places.shape)
     return PlanRuns(planned, free, dt, _largest(exact - reduced), _largest(off))
 
 

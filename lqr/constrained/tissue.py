@@ -5,6 +5,13 @@ One-way the tissue hears the hand through its acceleration a = M_s^{-1} (u - u_b
     eta'' + 2 delta eta' + omega^2 eta = -g a,    y_j = Y_j + q_s - q_bar + S_j eta
 
 for the place y_j of node j, Y_j at the target, eta = 0 in equilibrium, 2 delta = alpha + beta omega^2.
+
+A hand that feels the tissue, M_s q_s'' + G'z'' = u, is the same plant about the centre of mass r = q_s + M_s^{-1} G'z,
+
+    r'' = M_s^{-1} (u - u_bar),    (M_ee - G M_s^{-1} G') z'' + D z' + K z = -G r'',
+
+with the modes of this smaller mass: r stands for q_s, the hand is at q_s = r + S_hand eta, S_hand = -M_s^{-1} G'Phi,
+and every S_j contains S_hand.
 """
 
 from __future__ import annotations
@@ -12,10 +19,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, rows_on_all
+from softgrasp.fem.petsc import Array, on_root, rows_on_all
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
@@ -34,6 +42,7 @@ class ModalTissue:
     seen: Array  # S, displacement of the nodes in each mode, (nodes, d, k)
     c: Array  # outputs of the modes, (p, k)
     of: Array | None = None  # of a reduced one, its shapes by the modes of the full one, (n, k)
+    hand: Array | None = None  # S_hand of a hand that feels the tissue, (n_s, k); else None
 
     @property
     def delta(self) -> Array:
@@ -53,7 +62,13 @@ class ModalTissue:
         shapes = static_and_modes(self.omega, self.delta, self.g, self.c, k)
         squares, T = np.linalg.eigh(shapes.T @ (self.omega[:, None] ** 2 * shapes))
         V = shapes @ T
-        return ModalTissue(np.sqrt(squares), self.alpha, self.beta, V.T @ self.g, self.seen @ V, self.c @ V, V)
+        hand = None if self.hand is None else self.hand @ V
+        return ModalTissue(np.sqrt(squares), self.alpha, self.beta, V.T @ self.g, self.seen @ V, self.c @ V, V, hand)
+
+    @property
+    def relative(self) -> Array:
+        """Displacement of the nodes from the hand in each mode, (nodes, d, k)."""
+        return self.seen if self.hand is None else self.seen - self.hand
 
     def answer(self, a: Array, grid: float, parts: int) -> Array:
         """Amplitudes eta at the instants of all intervals under accelerations held from rest, (H, parts + 1, k).
@@ -132,7 +147,17 @@ def modal_tissue(problem: RiccatiProblem, surface: Surface, loop: ModalLoop | No
     plant = (loop or ModalLoop(problem, DENSE_LIMIT)).plant
     seen = np.zeros((len(surface.nodes), d, len(plant.omega)))
     seen[: surface.free] = rows_on_all(layout.comm, plant.Phi[surface.rows])
-    return ModalTissue(plant.omega, system.damping.alpha, system.damping.beta, plant.g, seen, plant.c)
+    tissue = ModalTissue(plant.omega, system.damping.alpha, system.damping.beta, plant.g, seen, plant.c)
+    return on_root(layout.comm, lambda: _about_centre(problem, tissue)) if system.two_way else tissue
+
+
+def _about_centre(problem: RiccatiProblem, tissue: ModalTissue) -> ModalTissue:
+    """The tissue of a hand that feels it, in the modes of M_ee - G M_s^{-1} G'."""
+    moved = np.linalg.solve(problem.M_s, tissue.g.T)  # M_s^{-1} G'Phi, (n_s, n)
+    squares, V = scipy.linalg.eigh(np.diag(tissue.omega**2), np.eye(len(tissue.omega)) - tissue.g @ moved)
+    hand = -moved @ V
+    seen, c = tissue.seen @ V + hand, tissue.c @ V + problem.C_s @ hand
+    return ModalTissue(np.sqrt(squares), 0.0, tissue.beta, V.T @ tissue.g, seen, c, None, hand)
 
 
 def require_plannable(problem: RiccatiProblem) -> None:
@@ -147,8 +172,10 @@ def _not_planned(problem: RiccatiProblem) -> str:
     system, layout = problem.system, problem.layout
     if layout.order != 1:
         return f"elements of order 1, whose edges stay straight; this scene has order {layout.order}"
-    if system.two_way or layout.n_s != layout.dimension:
-        return "a hand that neither turns nor feels the tissue; set effects.reaction and effects.rotation to false"
+    if layout.n_s != layout.dimension:
+        return "a hand that does not turn; set effects.rotation to false"
+    if system.two_way and system.damping.alpha:
+        return "a hand that feels the tissue only with Kelvin-Voigt damping; set effects.damping.alpha to zero"
     if system.points is not None:
         return "the linear plant; leave out effects.finite_strain"
     if system.own_load is not None:

@@ -150,7 +150,7 @@ def plan_control(
     surface = _surface(design.model)
     start = _at_rest(design)
     with watch.stage("bound"):
-        require_plannable(plant)
+        require_plan(design.model)
         loop = ModalLoop(plant, DENSE_LIMIT) if observed is None else observed.loop
         tissue = modal_tissue(plant, surface, loop)
         reduced = tissue.reduced(given.N // 2 - plant.layout.n_s)
@@ -265,6 +265,8 @@ def _online(
     from softgrasp.lqr.observer.tube import node_covariance, node_rows, run_tube
 
     problem = design.problem
+    if problem.system.two_way:
+        return None, "the hand feels the tissue; a plan is made again online for one that does not"
     try:
         controller = planned_controller(design, plan, modes, observed)
     except ControlError as error:
@@ -297,8 +299,19 @@ def _online(
 
 def require_plan(model: Model) -> None:
     """Raises ControlError: the scene has no plan, whatever its gain. Collective."""
-    plant = problem(model)
+    plant, given = problem(model), control_of(model)
     require_plannable(plant)
+    if plant.system.two_way:
+        if given.observer is not None:
+            raise ControlError(
+                "a plan with control.observer is made for a hand that does not feel the tissue; leave out "
+                "effects.reaction, or control.observer"
+            )
+        if given.constraints is not None and given.constraints.speed is not None:
+            raise ControlError(
+                "control.constraints.speed limits a hand whose speed changes linearly between instants; one that feels "
+                "the tissue swings between them: leave out speed, or effects.reaction"
+            )
     _given_force(model, plant.layout.n_s)
     if model.system.gravity is not None and model.scene.time.start != "equilibrium":
         raise ControlError(SWINGS)

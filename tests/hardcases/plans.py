@@ -19,6 +19,7 @@ from softgrasp.lqr.program.least_distance import nearest
 from tests.hardcases.cases import Family, HardCase, Outcome, here, make, textbook
 
 BODY = ("tissue.cells=[2, 4]", "control.constraints.N=14", "control.constraints.parts=4")
+NO_SPEED = "control.constraints={force=8.0, N=14, parts=4}"
 WALL = "{kind='halfspace', normal=[-1, 0], offset=-6.05}"
 DISC = "{kind='disc', center=[3.4, 1.2], radius=0.7}"
 
@@ -63,7 +64,10 @@ PLANS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("beta = 2e-4", (f"obstacle=[{WALL}]", "effects.damping={kind='kelvin-voigt', beta=2e-4}"), 0.0),
     ("no damping", (f"obstacle=[{WALL}]", "effects.damping=false", "control.method='modal'"), None),
     ("nu = 0.4999", (f"obstacle=[{WALL}]", "tissue.material={young=125.0, poisson=0.4999, rho=1.0}"), 0.0),
-    ("hand that feels the tissue", (f"obstacle=[{WALL}]", "effects.reaction=true"), None),
+    ("hand that feels the tissue", (f"obstacle=[{WALL}]", "effects.reaction=true", NO_SPEED), 0.0),
+    ("light hand that feels the tissue", (f"obstacle=[{WALL}]", "effects.reaction=true", "hand.mass=0.5", NO_SPEED,
+                                          "obstacle.0.offset=-6.5"), 0.0),
+    ("hand that feels the tissue, of limited speed", (f"obstacle=[{WALL}]", "effects.reaction=true"), None),
     ("hand that turns", (f"obstacle=[{WALL}]", "effects.rotation=true", "hand.inertia=5.0",
                        "motion.target=[5.0, 3.0, 0.0]", "control.outputs=[{kind='hand'}]"), None),
     ("wall with a micrometre more than the margins", (

@@ -198,9 +198,10 @@ def test_targets_without_a_gap_are_refused() -> None:
 
 @pytest.mark.parametrize(
     ("override", "sentence"),
-    [("effects.reaction=true", "neither turns nor feels"), ("tissue.order=2", "elements of order 1"),
+    [("tissue.order=2", "elements of order 1"),
      ("effects.finite_strain={}", "effects.finite_strain"),
-     ('effects.damping={kind="rayleigh", beta=0.002, alpha=0.1, drag="space"}', "acts against the hand")],
+     ('effects.damping={kind="rayleigh", beta=0.002, alpha=0.1, drag="space"}', "acts against the hand"),
+     ('effects={reaction=true, damping={kind="rayleigh", beta=0.002, alpha=0.1}}', "only with Kelvin-Voigt damping")],
 )  # fmt: skip
 def test_plants_without_a_plan_are_refused(override: str, sentence: str) -> None:
     model = build(load_scene("paper_lqr", ["tissue.cells=[4, 8]", override]))

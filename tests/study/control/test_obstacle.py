@@ -109,7 +109,7 @@ def test_error_of_the_linear_plant_becomes_a_margin_on_request(tmp_path: Path) -
         ("control.loop.limit=2.0", "control.loop.limit cuts the forces at 2 N"),
         ("obstacle.1.offset=-5.99", "at the target the gap to obstacle wall is -0.01 m"),
         ("obstacle.0.path={velocity=[0.01, 0.01]}", "obstacle disc moves towards the body at the target until the end"),
-        ("effects.reaction=true", "a plan past obstacles is made for a hand that neither turns nor feels the tissue"),
+        ("effects.reaction=true", "control.constraints.speed limits a hand whose speed changes linearly"),
         ("effects.gravity=[0, -0.1]", "a plan starts with the tissue in equilibrium"),
         ("control.constraints.horizon=1e9", "a plan of 1e+09 intervals would take about"),
         ("control.constraints.grid=1e4", "no gain is found for forces held over 10000 s"),
