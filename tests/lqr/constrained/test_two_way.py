@@ -89,7 +89,10 @@ def test_a_light_hand_that_feels_the_tissue_keeps_its_gaps() -> None:
 def test_what_a_hand_that_feels_the_tissue_has_not_is_refused() -> None:
     for change, sentence in (
         ("control.constraints={force=8.0, speed=1.0}", "control.constraints.speed limits"),
-        ("control={outputs=[{kind='hand'}], constraints={force=8.0}, observer={markers=[[0, 0]]}}", "a plan with control.observer"),
+        (
+            "control={outputs=[{kind='hand'}], constraints={force=8.0}, observer={markers=[[0, 0]]}}",
+            "a plan with control.observer",
+        ),
     ):
         model = build(load_scene("paper_obstacle", [*LIGHT, change]), comm=MPI.COMM_SELF)
         with pytest.raises(ControlError, match=sentence):
