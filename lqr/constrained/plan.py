@@ -238,7 +238,8 @@ def _at_target(task: Task, t: float) -> list[tuple[Array, Array]]:
             need = gap - float(free.min())
             raise ControlError(
                 f"at the target the gap to obstacle {name} is {gap:.4g} m and a plan needs more than {need:.4g} m, for "
-                "clearance and the bound of the reduced plant; move motion.target, raise control.constraints.N or lower grid"
+                "clearance and the bound of the reduced plant; move motion.target, raise control.constraints.N or "
+                "lower grid"
             )
         result.append((normal, free))
     return result
