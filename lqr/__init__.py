@@ -6,7 +6,8 @@ from softgrasp._face import face
 from softgrasp.fem import _stack as _stack  # threads and MPI before numpy and petsc4py
 
 if TYPE_CHECKING:
-    from softgrasp.lqr.constrained.plan import Plan, Task, quadratic_program
+    from softgrasp.lqr.constrained.plan import Plan, quadratic_program
+    from softgrasp.lqr.constrained.task import Task
     from softgrasp.lqr.dense.care import solve_reduced
     from softgrasp.lqr.design.constrained import PlannedControl, plan_control
     from softgrasp.lqr.design.controller import CertifiedController

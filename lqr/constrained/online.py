@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.constrained.horizon import HeldPlant, held
-from softgrasp.lqr.constrained.plan import ROOM, Plan, _at_target, _free, _price, _times, _turns
+from softgrasp.lqr.constrained.plan import ROOM, Plan, _price
 from softgrasp.lqr.constrained.rows import Limits, _pace, both_ends, follow, swings
+from softgrasp.lqr.constrained.task import at_target, free_ways, instants, path_turns
 from softgrasp.lqr.loop.controller import Controller
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.program.program import HARD, Program, octagon
@@ -190,18 +191,18 @@ def _program(plan: Plan, T: Array, x_bar: Array, ticks: Ticks, every: int, force
 def _all_rows(rows: _Rows, plan: Plan, way: _Way, force: Array, F: Array, D: Array) -> NDArray[np.int64]:
     """Rows of every interval and of all later ones; the first of each, (H + 2,)."""
     plant, task, H = plan.horizon.plant, plan.task, plan.horizon.steps
-    first, target, largest = [0], _at_target(task, H * plant.grid), force + np.abs(task.u_bar)
-    ends = np.vstack([_times(plan.horizon), np.full((1, plant.parts + 1), H * plant.grid)])
-    turns = [np.broadcast_to(_turns(plan.horizon, task, o, n), (H, plant.parts)) for o, n in enumerate(plan.normals)]
+    first, target, largest = [0], at_target(task, H * plant.grid), force + np.abs(task.u_bar)
+    ends = np.vstack([instants(plan.horizon), np.full((1, plant.parts + 1), H * plant.grid)])
+    turns = [path_turns(plan.horizon, task, o, n) for o, n in enumerate(plan.normals)]
     for k in range(H + 1):
         for o, (shape, (at_end, _)) in enumerate(zip(task.shapes, target, strict=True)):
             n = plan.normals[o, k] if k < H else at_end
             x = way.x[k] if k < H else np.zeros_like(way.x[0])
             moved = x @ np.einsum("d,jdn->jn", n, plant.Y).T
             inputs = way.u[k] if k < H else way.pushed
-            free = _free(shape, task, n[None])[0] - (task.shifts(o, ends[k]) @ n)[:, None]
+            free = free_ways(shape, task, n[None])[0] - (task.shifts(o, ends[k]) @ n)[:, None]
             if k < H:  # later it rests, or goes away along a line
-                free = free - rows.chord * both_ends(turns[o][k : k + 1, :, None])[0]
+                free = free - rows.chord * both_ends(np.broadcast_to(turns[o], (H, plant.parts))[k : k + 1, :, None])[0]
             rows.gaps(
                 o, n, free, moved, way.planned[k], way.most[k], way.boxes[k], way.near,
                 inputs, largest,
@@ -284,7 +285,7 @@ def _tail(plan: Plan, flow: _Flow, flows: Array, F: Array, force: Array, limits:
     pairs = np.einsum("men,inr->imer", T, shown[:-1]) + np.einsum("mes,sr->mer", W, K)
     size = np.linalg.norm(pairs, axis=2) * _pace(plant)[None, :, None]  # (parts, modes, n)
     b = (np.abs(K) / (force - np.abs(task.u_bar))[:, None]).max(axis=0)
-    for normal, free in _at_target(task, plan.horizon.steps * plant.grid):
+    for normal, free in at_target(task, plan.horizon.steps * plant.grid):
         rows = np.abs(np.einsum("d,jdn,inr->ijr", normal, plant.Y, shown))
         seen = np.abs(np.einsum("d,jdm->jm", normal, plant.tissue.seen))
         bend = np.einsum("jm,imr->ijr", seen, size) + np.abs(normal @ plant.B[n_s : 2 * n_s] @ K)

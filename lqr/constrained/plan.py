@@ -7,20 +7,20 @@ That of an obstacle on a known path moves with it, n.(y - s(t)) >= h(n).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from itertools import pairwise, product
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import ResourceError
-from softgrasp.fem.obstacles.obstacle import Path
 from softgrasp.fem.obstacles.shapes import HalfSpace, Shape
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.resources import free_memory, size_text
 from softgrasp.lqr.constrained.horizon import HeldPlant, Horizon
-from softgrasp.lqr.constrained.rows import Limits, bends, both_ends, broken, follow, gap_rows, limit_rows, tail_level
-from softgrasp.lqr.constrained.separation import past, separate, supports
+from softgrasp.lqr.constrained.rows import bends, both_ends, broken, follow, gap_rows, limit_rows, tail_level
+from softgrasp.lqr.constrained.separation import past, separate
+from softgrasp.lqr.constrained.task import Task, after_paths, at_target, free_ways, instants, path_turns, seen_by
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.program.least_distance import InfeasibleError, nearest, nearest_soft
 
@@ -35,45 +35,6 @@ PRICE = 20.0  # of a metre inside an obstacle, over the mean cost of a metre of 
 SLIGHT = 1e-10  # [m]: a slack that is rounding of the price
 ROUNDING = 1e-10  # of the extent of the body [1]: what every row keeps beyond its bound
 TIGHT = 1e-9  # of the extent of the body [1]: a row so near to its bound holds the plan
-
-
-@dataclass(frozen=True)
-class Task:
-    """What a plan has to do."""
-
-    start: Array  # x_0 of the reduced plant, from the target, (N,)
-    places: Array  # nodes of the body at the target [m], (nodes, d)
-    u_bar: Array  # steady input at the target [N], (n_s,)
-    shapes: tuple[Shape, ...]  # obstacles
-    names: tuple[str, ...]  # of the obstacles
-    error: Array  # margin for what the reduced plant leaves out at every node [m], (nodes, d)
-    clearance: float = 0.0  # distance to keep beyond that [m]
-    limits: Limits = field(default_factory=Limits)  # of the hand
-    noise: Array | float = 0.0  # margin for what noise moves every node [m], (nodes, d) or 0
-    bounded: bool = True  # whether ``error`` is a proved bound
-    penalty: float | None = None  # cost of a metre inside an obstacle [1/m]; None: :data:`PRICE` times that of the way
-    paths: tuple[Path | None, ...] = ()  # translation of each obstacle; empty where all are fixed
-
-    def path(self, i: int) -> Path | None:
-        """Translation of an obstacle, None for a fixed one."""
-        return self.paths[i] if self.paths else None
-
-    def shifts(self, i: int, times: Array) -> Array:
-        """Displacement of an obstacle at times [s], (.., d) [m]."""
-        path, d = self.path(i), self.places.shape[1]
-        if path is None:
-            return np.zeros((*np.shape(times), d))
-        return np.array([path(float(t)) for t in np.ravel(times)]).reshape(*np.shape(times), d)
-
-    def separate(self, i: int, body: Array, t: float) -> tuple[Array, float]:
-        """Normal between a body (nodes, d) and an obstacle at a time, and the gap [m]."""
-        return separate(self.shapes[i], body - self.shifts(i, np.asarray(t)))
-
-    def gaps(self, body: Array, times: Array) -> Array:
-        """Gap of the body (count, nodes, d) to every obstacle at times [s], (count, obstacles) [m]."""
-        count = range(len(self.shapes))
-        every = [[self.separate(i, at, t)[1] for i in count] for at, t in zip(body, times.tolist(), strict=True)]
-        return np.array(every).reshape(len(body), -1)
 
 
 @dataclass(frozen=True)
@@ -165,11 +126,11 @@ def make_plan(plant: HeldPlant, task: Task, steps: int, longest: int | None = No
     """
     automatic = longest is None
     longest = LONGEST * steps if longest is None else longest
-    steps = _after_paths(plant, task, steps, longest)
+    steps = after_paths(plant, task, steps, longest)
     if automatic:
         _check_in_time(plant, task, longest * plant.grid)
     while True:
-        level = tail_level(plant, _at_target(task, steps * plant.grid), task.limits, task.u_bar)
+        level = tail_level(plant, at_target(task, steps * plant.grid), task.limits, task.u_bar)
         if not level > 0:
             raise ControlError("the steady force at the target is not below its limit; raise control.constraints.force")
         _check_memory(plant, task, steps)
@@ -205,81 +166,10 @@ def _check_in_time(plant: HeldPlant, task: Task, longest: float) -> None:
         )
 
 
-def _after_paths(plant: HeldPlant, task: Task, steps: int, longest: int) -> int:
-    """Intervals, at least ``steps``, after which no obstacle comes nearer to the body at the target.
-
-    Raises ControlError: there are more than ``longest``.
-    """
-    for i, name in enumerate(task.names):
-        path, first = task.path(i), steps
-        if path is None:
-            continue
-        if np.isfinite(path.end):
-            steps = max(steps, int(np.ceil(path.end / plant.grid - 1e-9)))
-        else:  # at a constant velocity, for ever
-            ends = (k * plant.grid for k in range(first, longest + 1))
-            away = (task.separate(i, task.places, t)[0] @ path(t, 1) <= 0 for t in ends)
-            steps = next((first + k for k, leaves in enumerate(away) if leaves), longest + 1)
-        if steps > longest:
-            raise ControlError(
-                f"obstacle {name} moves towards the body at the target until the end of the longest plan, of "
-                f"{longest * plant.grid:.4g} s; give a path that ends or leaves, or set control.constraints.horizon"
-            )
-    return steps
-
-
-def _at_target(task: Task, t: float) -> list[tuple[Array, Array]]:
-    """Normal and free way of every node at the target, from time t on; raises ControlError where there is none."""
-    result = []
-    for i, (shape, name) in enumerate(zip(task.shapes, task.names, strict=True)):
-        normal, gap = task.separate(i, task.places, t)
-        free = _free(shape, task, normal[None])[0] - normal @ task.shifts(i, np.asarray(t))
-        if not free.min() > 0:
-            need = gap - float(free.min())
-            raise ControlError(
-                f"at the target the gap to obstacle {name} is {gap:.4g} m and a plan needs more than {need:.4g} m, for "
-                "clearance and the bound of the reduced plant; move motion.target, raise control.constraints.N or "
-                "lower grid"
-            )
-        result.append((normal, free))
-    return result
-
-
-def _free(shape: Shape, task: Task, normals: Array) -> Array:
-    """Way of every node at the target to the half-spaces of an obstacle, less clearance and margin, (count, nodes).
-
-    Of the obstacle where the scene puts it.
-    """
-    off = normals @ task.places.T - supports(shape, normals)[:, None]
-    return np.asarray(off - task.clearance - np.abs(normals) @ (task.error + task.noise).T)
-
-
-def _times(horizon: Horizon, steps: int | None = None) -> Array:
-    """All instants of a number of intervals [s], (H, parts + 1); those behind the horizon are its end."""
-    plant, H = horizon.plant, horizon.steps
-    times = np.arange(H if steps is None else steps)[:, None] + np.arange(plant.parts + 1) / plant.parts
-    return np.asarray(plant.grid * np.minimum(times, H))
-
-
-def _turns(horizon: Horizon, task: Task, i: int, normals: Array) -> Array | float:
-    """Bound on the acceleration of an obstacle along the normals of intervals, (count, parts) [m/s2]."""
-    path = task.path(i)
-    if path is None:
-        return 0.0
-    ends = _times(horizon, len(normals))
-    most = [[path.fastest_turn(a, b) for a, b in pairwise(row)] for row in ends.tolist()]
-    return np.asarray(np.einsum("kd,kid->ki", np.abs(normals), np.array(most)))
-
-
-def _off(horizon: Horizon, task: Task, i: int, body: Array) -> Array:
-    """Places of the body (H, parts + 1, nodes, d) as an obstacle sees them, that moves from where the scene puts it."""
-    return np.asarray(body - task.shifts(i, _times(horizon, len(body)))[:, :, None])
-
-
 def _cheapest(horizon: Horizon, task: Task, level: float) -> Plan:
     """All sides of the obstacles on the way."""
     free = places(horizon, task, np.zeros(horizon.plant.n_s * horizon.steps))
-    seen = [_off(horizon, task, i, free) for i in range(len(task.shapes))]
+    seen = [seen_by(horizon, task, i, free) for i in range(len(task.shapes))]
     first = [_normals(shape, body) for shape, body in zip(task.shapes, seen, strict=True)]
     moving = [i for i, shape in enumerate(task.shapes) if not isinstance(shape, HalfSpace)]
     on_way = [i for i in moving if _left(task.shapes[i], task, first[i], seen[i]).min() < 0]
@@ -298,7 +188,7 @@ def _cheapest(horizon: Horizon, task: Task, level: float) -> Plan:
 
 def _left(shape: Shape, task: Task, normals: Array, body: Array) -> Array:
     """What clearance and margin leave of the gap of every node at all instants, (H, parts + 1, nodes)."""
-    return np.asarray(_free(shape, task, normals)[:, None] + np.einsum("kd,kijd->kij", normals, body - task.places))
+    return np.asarray(free_ways(shape, task, normals)[:, None] + np.einsum("kd,kijd->kij", normals, body - task.places))
 
 
 def _normals(shape: Shape, body: Array) -> Array:
@@ -327,7 +217,7 @@ def _rounds(horizon: Horizon, task: Task, normals: Array, level: float, sides: t
         if len(costs) > 1 and abs(costs[-1] - costs[-2]) <= SETTLED * costs[-1] and (plan.gap >= 0 or plan.depth > 0):
             break
         body = plan.body()
-        normals = np.array([_normals(s, _off(horizon, task, i, body)) for i, s in enumerate(task.shapes)])
+        normals = np.array([_normals(s, seen_by(horizon, task, i, body)) for i, s in enumerate(task.shapes)])
         normals = normals.reshape(-1, horizon.steps, body.shape[-1])
     assert best is not None
     return replace(best, costs=tuple(costs), steps=steps)
@@ -362,9 +252,9 @@ def _rows(horizon: Horizon, task: Task, normals: Array, c: Array) -> tuple[Array
     x, u = horizon.state(task.start, c), horizon.input(task.start, c)
     rounding = ROUNDING * float(np.ptp(task.places, axis=0).max())  # so that no gap of the plan is below zero by it
     for i, (shape, n) in enumerate(zip(task.shapes, normals, strict=True)):
-        margin = ROOM * both_ends(bends(horizon.plant, x, u, n, _turns(horizon, task, i, n)))
-        moved = np.einsum("kd,kid->ki", n, task.shifts(i, _times(horizon)))[:, :, None]
-        G, h = gap_rows(horizon, task.start, n, _free(shape, task, n)[:, None] - moved - margin - rounding)
+        margin = ROOM * both_ends(bends(horizon.plant, x, u, n, path_turns(horizon, task, i, n)))
+        moved = np.einsum("kd,kid->ki", n, task.shifts(i, instants(horizon)))[:, :, None]
+        G, h = gap_rows(horizon, task.start, n, free_ways(shape, task, n)[:, None] - moved - margin - rounding)
         rows.append(G)
         right.append(h)
     h = np.concatenate(right)
@@ -404,14 +294,14 @@ def _judged(
     if len(u) - H == MOST_FOLLOWED:
         unsafe[-1] = True
     gap, bend = np.inf, 0.0
-    target = _at_target(task, H * plant.grid)
+    target = at_target(task, H * plant.grid)
     for i, (shape, ahead, (normal, _)) in enumerate(zip(task.shapes, normals, target, strict=True)):
         n = np.concatenate([ahead, np.tile(normal, (len(u) - H, 1))])
-        turns = _turns(horizon, task, i, n)
+        turns = path_turns(horizon, task, i, n)
         if len(u) > H and not isinstance(turns, float):
             turns[H:] = 0.0  # it rests, or goes away along a line
         own = both_ends(bends(plant, x, u, n, turns))
-        left = _left(shape, task, n, _off(horizon, task, i, body)) - own
+        left = _left(shape, task, n, seen_by(horizon, task, i, body)) - own
         gap = min(gap, float(left.min()))
         unsafe |= (left < 0).any(axis=(1, 2))
         holds = left[:H] <= (ROOM - 1) * own[:H] + TIGHT * float(np.ptp(task.places))

@@ -16,10 +16,11 @@ from softgrasp.fem.obstacles import make_obstacles
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.constrained.horizon import held_plant
 from softgrasp.lqr.constrained.online import Ticks, carried_ticks, make_program
-from softgrasp.lqr.constrained.plan import Plan, Task, make_plan
+from softgrasp.lqr.constrained.plan import Plan, make_plan
 from softgrasp.lqr.constrained.pulse import PulseError
 from softgrasp.lqr.constrained.rows import Limits
 from softgrasp.lqr.constrained.run import STEPS, PlanRuns, run_inputs, run_plan
+from softgrasp.lqr.constrained.task import Task
 from softgrasp.lqr.constrained.tissue import ModalTissue, Surface, make_surface, modal_tissue, require_plannable
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.linearise import finite_problem

@@ -15,10 +15,11 @@ from softgrasp.fem.obstacles.shapes import Ball, HalfSpace, Shape
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.constrained import plan as planning
 from softgrasp.lqr.constrained.horizon import HeldPlant, held_plant
-from softgrasp.lqr.constrained.plan import Plan, Task, make_plan, quadratic_program
+from softgrasp.lqr.constrained.plan import Plan, make_plan, quadratic_program
 from softgrasp.lqr.constrained.pulse import PulseError
 from softgrasp.lqr.constrained.rows import Limits, follow
 from softgrasp.lqr.constrained.run import PlanRuns, run_plan
+from softgrasp.lqr.constrained.task import Task
 from softgrasp.lqr.constrained.tissue import ModalTissue, Surface, make_surface, modal_tissue
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.checks import ControlError
@@ -66,14 +67,14 @@ def inputs_until(plan: Plan, intervals: int) -> np.ndarray:
     return np.concatenate([plan.inputs, tail + plan.task.u_bar])
 
 
-@pytest.mark.parametrize(("N", "margin"), [(14, 1.5e-3), (22, 2.2e-4), (30, 1.2e-4)])
+@pytest.mark.parametrize(("N", "margin"), [(14, 1.5e-3), (22, 2.1e-4), (30, 1.19e-4)])
 def test_wall_is_kept_on_the_full_plant(N: int, margin: float) -> None:
     plant, given = task(N, WALL)
     plan = make_plan(plant, given, 30)
     runs = run(plan)
     optimal = runs.free.cost
     assert plan.certified
-    assert given.error.max() < margin  # the l1 bound of the prototype at the instants of the rows, and its remainder
+    assert given.error.max() < margin  # at every time, 1.33e-3, 1.97e-4 and 1.184e-4; N = 30 at the rows alone 9.9e-5
     assert runs.planned.least[0] >= 0
     assert runs.free.least[0] < -0.17  # LQR goes through the wall
     assert np.abs(runs.planned.inputs).max() <= FORCE * (1 + 1e-9)
