@@ -110,15 +110,18 @@ def estimate(
     )
 
 
-def extrapolated(result: MeshEstimate, model: Model) -> MeshEstimate:
+def extrapolated(result: MeshEstimate, model: Model, n_e: int | None = None) -> MeshEstimate:
     """The estimate of a box from that of the same box on coarser cells. Collective.
 
     On lines that crowd at singular ends errors fall with the order of the elements, on even cells with order 1, in
     n_e^(1/d). So the estimate is 0.6 to 1.8 of that on the cells themselves, see the tests; the bound allows twice.
+
+    ``n_e``: unknowns of the box; None: those of the model.
     """
     layout, tissue = model.system.layout, model.scene.tissue
     graded = tissue.refine is not None and tissue.refine.grading != "off"
-    share = (result.n_e / layout.n_e) ** ((tissue.order if graded else 1) / layout.dimension)
+    unknowns = n_e or layout.n_e
+    share = (result.n_e / unknowns) ** ((tissue.order if graded else 1) / layout.dimension)
     return replace(
         result,
         estimate=share * result.estimate,
@@ -126,7 +129,7 @@ def extrapolated(result: MeshEstimate, model: Model) -> MeshEstimate:
         delta=np.zeros_like(result.delta),
         omega=tuple(share * x for x in result.omega),
         shift=zone_shift(model),
-        n_e=layout.n_e,
+        n_e=unknowns,
         by="coarser",
     )
 

@@ -85,7 +85,11 @@ def need(scene: Scene, dimension: int, cells: int, ranks: int, free: float, run:
 def solver_of(scene: Scene, layout: BlockLayout) -> tuple[SolverName, str]:
     """The solver of the steps of a scene, with the reason in words. Collective."""
     free = layout.comm.allreduce(free_bytes(scene), MPI.MIN)
-    work = steps_of(scene, layout.n_e, layout.dimension, layout.comm.size)
+    return chosen(scene, steps_of(scene, layout.n_e, layout.dimension, layout.comm.size), free)
+
+
+def chosen(scene: Scene, work: Work, free: float) -> tuple[SolverName, str]:
+    """The solver of steps that do so much work, with ``free`` bytes of memory, and the reason in words."""
     name = work.solver(scene.time.solver, free)
     return name, work.reason(scene.time.solver, free) + work.price_of_bits(name)
 

@@ -80,21 +80,22 @@ def forecast(scene: Scene, n: int, d: int, cells: int, ranks: int, free: float =
     )
 
 
-def forecasts(model: Model) -> tuple[Forecast, ...]:
+def forecasts(model: Model, n_e: int | None = None, cells: int | None = None) -> tuple[Forecast, ...]:
     """Modelled time and memory of a run on its own number of ranks and on :data:`RANKS`, linear only. Collective.
 
     Ranks beyond the cores of this node are on further nodes like it.
+
+    Args:
+        n_e, cells: unknowns and cells of the run; None: those of the model.
     """
-    scene, layout, mesh = model.scene, model.system.layout, model.space.mesh
+    scene, layout = model.scene, model.system.layout
     if model.system.points is not None or model.system.frame is not None:
         return ()
     comm, cores = layout.comm, psutil.cpu_count(logical=False) or 1
     free = comm.allreduce(free_bytes(scene), MPI.MIN)
-    cells = int(mesh.mesh.topology.index_map(mesh.dimension).size_global)
+    n, simplices = n_e or layout.n_e, cells or model.cells
     counts = sorted({*RANKS, comm.size})
-    return tuple(
-        forecast(scene, layout.n_e, layout.dimension, cells, ranks, free * -(-ranks // cores)) for ranks in counts
-    )
+    return tuple(forecast(scene, n, layout.dimension, simplices, ranks, free * -(-ranks // cores)) for ranks in counts)
 
 
 def told(results: Sequence[Forecast]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -23,11 +24,20 @@ from softgrasp.fem.effects import EFFECTS, Gate
 from softgrasp.fem.effects.gate import SMALL_SHARE, Sag
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.model.memory import Need, factor_bytes, free_bytes, need, solver_of
+from softgrasp.fem.model.memory import (
+    Need,
+    box_simplices,
+    check_memory,
+    chosen,
+    factor_bytes,
+    free_bytes,
+    need,
+    steps_of,
+)
 from softgrasp.fem.model.refined import by_lines, scene_ends
 from softgrasp.fem.model.scales import measure
 from softgrasp.fem.run.forecast import Forecast, forecasts
-from softgrasp.fem.solve.solvers import DIRECT_LIMIT, factor_on_every_rank
+from softgrasp.fem.solve.solvers import DIRECT_LIMIT
 from softgrasp.study.forward.accuracy import estimate_error
 from softgrasp.study.forward.cautions import (
     coarse,
@@ -49,6 +59,7 @@ MODES = 6
 MOST_LOOKED_AT = {2: 20_000, 3: 6_000}  # unknowns that modes and sag are computed on
 ESTIMATE_SECONDS = 1.0  # a dearer estimate of the mesh is left to simulate
 LARGE = 200_000  # cells beyond which rank 0 does not look for the ends
+MOST_BUILT = 200_000  # unknowns of a box beyond which its sizes are computed and nothing of it is assembled
 
 
 @dataclass(frozen=True)
@@ -129,6 +140,7 @@ class Explanation:
     snapshot_bytes: int  # memory of these states over all ranks [byte]
     mesh: MeshReport  # singular ends, and the error they leave
     coarser: int  # unknowns of the coarser copy of a large mesh that gives modes, sag and estimate [1]; 0: none
+    built: bool  # whether the mesh itself was; else its sizes are computed, to three digits
     dimension: int  # 2 or 3
     plan: PlanSizes | None = None  # of the plan past obstacles that `control` makes; None where it makes none
 
@@ -139,40 +151,81 @@ class Explanation:
 
 
 def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
-    """Assemble a scene and say what it is. Collective."""
+    """Assemble a scene, of a large box a copy on fewer cells, and say what it is. Collective."""
+    if unknowns_of(scene) > MOST_BUILT:
+        check_memory(scene, comm, False, len(scene.tissue.cells or []), box_simplices(scene.tissue.cells or []))
+        copy = on_fewer_cells(scene, comm)
+        if copy is not None:
+            return _explained(scene, copy, sizes_from(copy, scene))
     return explain_model(build(scene, comm=comm, run=False))
 
 
 def explain_model(model: Model) -> Explanation:
     """Say what a built model is. Collective. Raises SolverError: its modes or its sag cannot be computed."""
-    scene, system = model.scene, model.system
-    layout = system.layout
-    d, ranks = layout.dimension, layout.comm.size
-    name, reason = solver_of(scene, layout)
-    copies = ranks if factor_on_every_rank(layout, name, scene.time.reproducible) else 1
-    looked = coarser_copy(model)
+    return _explained(model.scene, coarser_copy(model), model_sizes(model), model)
+
+
+def unknowns_of(scene: Scene) -> int:
+    """Unknowns of the lattice of a box of even cells, those of the contact zone included; 0 for other scenes.
+
+    Scenes are others too where an obstacle or a plan asks for the boundary nodes of the mesh itself.
+    """
+    tissue, control = scene.tissue, scene.control
+    planned = control is not None and control.constraints is not None
+    if not tissue.cells or tissue.refine is not None or scene._given is not None:
+        return 0
+    return 0 if scene.effects.obstacles or planned else _lattice(scene) * len(tissue.cells)
+
+
+def _lattice(scene: Scene) -> int:
+    """Nodes of a box of even cells."""
+    return math.prod(scene.tissue.order * n + 1 for n in scene.tissue.cells or [])
+
+
+def sizes_from(copy: Model, scene: Scene) -> ModelSizes:
+    """Sizes of a box from those of its copy on fewer cells, three digits of the unknowns and entries. Collective."""
+    sizes, d = model_sizes(copy), copy.system.layout.dimension
+    nodes = _lattice(scene)
+    held = (d * sizes.nodes - sizes.n_e) * (nodes / sizes.nodes) ** ((d - 1) / d)  # the zone is a surface
+    n_e = float(f"{d * nodes - held:.2e}")
+    nonzeros = float(f"{sizes.nonzeros * n_e / sizes.n_e:.2e}")
+    return replace(
+        sizes, n_e=int(n_e), states=2 * (sizes.n_s + int(n_e)), cells=box_simplices(scene.tissue.cells or []),
+        nodes=nodes, nonzeros=int(nonzeros),
+    )  # fmt: skip
+
+
+def _explained(scene: Scene, looked: Model, sizes: ModelSizes, model: Model | None = None) -> Explanation:
+    """The explanation of a scene of these sizes; modes and sag are those of ``looked``.
+
+    Collective. ``model``: that of the scene, None where it was not built.
+    """
+    comm, d, ranks = looked.system.layout.comm, looked.system.layout.dimension, sizes.ranks
+    free = comm.allreduce(free_bytes(scene), MPI.MIN)
+    work = steps_of(scene, sizes.n_e, d, ranks)
+    name, reason = chosen(scene, work, free)
+    copies = ranks if work.repeated(name) else 1
     small = looked.system
     if small.layout.n_e <= DIRECT_LIMIT[d]:  # the modes need a factor
         omega, Phi = lowest_modes(small, min(MODES, small.layout.n_e))
     else:
         omega, Phi = np.zeros(0), np.zeros((small.layout.n_local, 0))
-    problem = measure(looked, omega, Phi, largest_acceleration(scene, layout.n_s, system.M_hand))
+    problem = measure(looked, omega, Phi, largest_acceleration(scene, sizes.n_s, small.M_hand))
     reports = {
         key: EffectReport(e.active(scene), e.term, e.operators(scene), e.cost, e.gate(problem))
         for key, e in EFFECTS.items()
     }
-    sizes = model_sizes(model)
     stored = scene.output.snapshots in ("auto", "memory")
     columns = scene.time.steps // scene.output.every + 1 if stored else 0
     if scene.output.snapshots == "auto":
-        columns = len(spread(columns, looked_at(layout.n_e)))
+        columns = len(spread(columns, looked_at(sizes.n_e)))
     dt = scene.time_end / scene.time.steps
-    poisson = poisson_ratios(system)
+    poisson = poisson_ratios(small)
     return Explanation(
         name=scene.name,
         equation=equation(scene),
         sizes=sizes,
-        solver=SolverPlan(name, reason, factor_bytes(name, layout.n_e, d, copies)),
+        solver=SolverPlan(name, reason, factor_bytes(name, sizes.n_e, d, copies)),
         time=TimePlan(
             steps=scene.time.steps,
             dt=dt,
@@ -187,20 +240,21 @@ def explain_model(model: Model) -> Explanation:
         idle=tuple(key for key, r in reports.items() if r.on and not r.gate.matters),
         sag=problem.sag,
         warnings=(
-            *model.space.mesh.notes,
+            *(looked if model is None else model).space.mesh.notes,
             *_warnings(scene, poisson, omega, dt, d, reports, problem.sag),
-            *small_obstacles(model),
+            *([] if model is None else small_obstacles(model)),
             *out_of_reach(looked, problem.response.rms, problem.length),
         ),
-        outputs=output_places(model),
-        memory=need(scene, d, sizes.cells, ranks, layout.comm.allreduce(free_bytes(scene), MPI.MIN), run=True),
-        forecasts=forecasts(model),
+        outputs=output_places(looked if model is None else model),
+        memory=need(scene, d, sizes.cells, ranks, free, run=True),
+        forecasts=forecasts(looked, sizes.n_e, sizes.cells),
         snapshot_columns=columns,
-        snapshot_bytes=16 * layout.n_e * columns,
-        mesh=mesh_report(model, looked),
+        snapshot_bytes=16 * sizes.n_e * columns,
+        mesh=mesh_report(looked, sizes.n_e, model),
         coarser=0 if looked is model else small.layout.n_e,
+        built=model is not None,
         dimension=d,
-        plan=_plan(model),
+        plan=None if model is None else _plan(model),
     )
 
 
@@ -220,33 +274,49 @@ def coarser_copy(model: Model) -> Model:
     adaptive = tissue.refine is not None and tissue.refine.tolerance is not None
     if tissue.cells is None or adaptive or layout.n_e <= most:
         return model
-    ratio = (most / layout.n_e) ** (1 / layout.dimension)
-    cells = [max(int(ratio * n), 1) for n in tissue.cells]
-    other = scene.model_copy(update={"tissue": tissue.model_copy(update={"cells": cells})})
+    return on_fewer_cells(scene, layout.comm) or model
+
+
+def on_fewer_cells(scene: Scene, comm: MPI.Intracomm) -> Model | None:
+    """The scene of a box on fewer cells; None where these miss the zone or a layer. Collective."""
+    cells = scene.tissue.cells or []
+    ratio = (MOST_LOOKED_AT[len(cells)] / (len(cells) * _lattice(scene))) ** (1 / len(cells))
+    fewer = [max(int(ratio * n), 1) for n in cells]
+    other = scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"cells": fewer})})
     try:
-        return build(other, comm=layout.comm, run=False)
-    except (MeshError, SceneError):  # cells so large miss the contact zone or a layer
-        return model
+        return build(other, comm=comm, run=False)
+    except (MeshError, SceneError):
+        return None
 
 
-def mesh_report(model: Model, looked: Model) -> MeshReport:
+def mesh_report(looked: Model, n_e: int, model: Model | None) -> MeshReport:
     """Look for singular ends and estimate the error, that of a coarser copy where the mesh takes long. Collective."""
-    scene, tissue = model.scene, model.space.mesh
+    known = looked if model is None else model
+    scene, tissue = known.scene, known.space.mesh
     refine = scene.tissue.refine
     small = tissue.mesh.topology.index_map(tissue.dimension).size_global <= LARGE
-    ends = scene_ends(model.system.layout.comm, tissue, scene) if small else None
+    ends = scene_ends(known.system.layout.comm, tissue, scene) if small else None
     pairs = () if ends is None else zip(ends.kind, ends.alpha, strict=True)
     counts = Counter((kind, round(float(alpha), 3)) for kind, alpha in pairs)
     kinds = tuple(EndReport(k, n, a) for (k, a), n in sorted(counts.items(), key=lambda item: item[0][1]))
     graded = refine is not None and refine.grading != "off"
     edges = graded and tissue.dimension == 3 and not by_lines(scene)
     order = 2.0 * scene.tissue.order if ends is None else expected_order(ends, scene.tissue.order, graded, edges)
-    error = estimate_error(model, ESTIMATE_SECONDS)[0]
+    error = None if model is None else estimate_error(model, ESTIMATE_SECONDS)[0]
     if error is None and looked is not model:
         found = estimate_error(looked, ESTIMATE_SECONDS)[0]
-        error = None if found is None else extrapolated(found, model)
+        error = None if found is None else extrapolated(found, known, n_e)
     coarse = error is not None and error.by == "coarser"
-    values = (None,) * 4 if error is None else (error.estimate, error.bound, error.time_error, error.shift)
+    values = (
+        (None,) * 4
+        if error is None
+        else (
+            error.estimate,
+            error.bound,
+            error.time_error,
+            None if model is None else error.shift,
+        )
+    )
     first = refine is not None and refine.tolerance is not None and refine.passes > 0
     return MeshReport(kinds, order, graded, first, coarse, *values)
 

@@ -24,7 +24,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from softgrasp.study.forward.cautions import inexact, run_warnings
-from softgrasp.study.forward.explain import Explanation, explain
+from softgrasp.study.forward.explain import Explanation, explain, unknowns_of
 from softgrasp.study.forward.explain_page import run_explain, sections
 from softgrasp.study.report.document import show_sections
 from softgrasp.study.report.equation import equation
@@ -301,3 +301,39 @@ def test_a_large_scene_is_explained_by_coarser_cells(
     said = io.StringIO()
     show_sections(Console(file=said, width=300), sections(copied))
     assert f"on coarser cells, n_e = {copied.coarser}" in said.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "cells"),
+    [
+        ("paper_forward", ["tissue.order=2"], "tissue.cells=[40,80]"),
+        ("block_3d", ["tissue.order=1", "tissue.refine=false"], "tissue.cells=[10,9,17]"),
+    ],
+)
+def test_a_box_too_large_to_build_is_explained_by_computed_sizes(
+    comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch, name: str, changes: list[str], cells: str
+) -> None:
+    """Sizes against those of the mesh itself, the rest against the copy that a smaller mesh is explained by."""
+    scene = load_scene(name, [*changes, cells])
+    monkeypatch.setattr("softgrasp.study.forward.explain.MOST_LOOKED_AT", {2: 4_000, 3: 2_000})
+    own = explain(scene, comm)
+    monkeypatch.setattr("softgrasp.study.forward.explain.MOST_BUILT", 1000)
+    computed = explain(scene, comm)
+    assert (own.built, computed.built, computed.coarser) == (True, False, own.coarser)
+    assert (computed.sizes.nodes, computed.sizes.cells) == (own.sizes.nodes, own.sizes.cells)
+    assert computed.sizes.n_e == pytest.approx(own.sizes.n_e, rel=0.02)  # a zone of whole facets of few cells
+    assert computed.sizes.nonzeros == pytest.approx(own.sizes.nonzeros, rel=0.1)  # shorter rows at the surface
+    assert (computed.time, computed.sag, computed.effects) == (own.time, own.sag, own.effects)
+    assert computed.mesh.shift is None
+    said = io.StringIO()
+    show_sections(Console(file=said, width=300), sections(computed))
+    assert f"n_e = about {computed.sizes.n_e}" in said.getvalue()
+    assert "is not assembled" in said.getvalue()
+
+
+def test_scenes_that_need_their_own_mesh_are_built() -> None:
+    """Graded cells, and obstacles, which ask for the distance of boundary nodes."""
+    cells = "tissue.cells=[400,800]"
+    assert unknowns_of(load_scene("paper_forward", [cells])) == 2 * 401 * 801
+    assert unknowns_of(load_scene("paper_forward", [cells, "tissue.refine={}"])) == 0
+    assert unknowns_of(load_scene("push_disc", [cells])) == 0
