@@ -20,12 +20,21 @@ class ObstaclesEffect(Effect):
 
     def gate(self, problem: Problem) -> Gate:
         """Number of obstacles; only a run determines whether the tissue gets there."""
-        number = len(problem.scene.obstacle or [])
+        from softgrasp.fem.obstacles.spacing import MOST, base_parts  # few scenes need it
+
+        scene, entries = problem.scene, problem.scene.obstacle or []
+        number = len(entries)
+        parts = max((base_parts(entry, scene.tissue.order, problem.dimension) for entry in entries), default=1)
+        between = f"Nodes touch, and points that divide boundary edges in {parts}" if parts > 1 else "Nodes touch"
+        if any(entry.friction for entry in entries):
+            between = "Nodes touch"
+        elif any(entry.parts is None and entry.kind != "halfspace" for entry in entries):
+            between += f"; points are half an obstacle apart that is smaller than an edge, {MOST} to an edge at most"
         sentence = (
             "Off; the scene has no [[obstacle]]."
             if number == 0
-            else "A run that touches no obstacle is that without the effect, bit for bit; it reports the least gap."
-            if self.active(problem.scene)
+            else f"{between}. A run without touch is that without the effect, bit for bit; it reports the least gap."
+            if self.active(scene)
             else "Off; the tissue goes through the obstacles that control plans around."
         )
         return Gate(number, "number of obstacles", self.threshold, number > self.threshold, sentence)

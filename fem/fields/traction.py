@@ -57,9 +57,9 @@ class ContactTraction:
         self.phi = scipy.sparse.csr_matrix((phi.ravel(), (rows, nodes[cell, : d + 1].ravel())), shape=(count, count))
 
     def __call__(self, surface: Surface, forces: Array) -> Array:
-        """Traction (local nodes, d) [Pa] of forces (p, d) [N] on boundary nodes, ghosts updated. Collective."""
+        """Traction (local nodes, d) [Pa] of forces (p, d) [N] on boundary points, ghosts updated. Collective."""
         part = np.zeros(self.space.layout.n_local)
-        part[surface.rows] = forces.ravel()[surface.mine]
+        part[surface.rows] = surface.on_nodes(forces.ravel())[surface.mine]
         f = self.space.nodal(part).x.array.reshape(-1, self.d)
         F = self._exchanged(self.phi.T @ f, add=True)
         size = np.linalg.norm(F, axis=1)

@@ -275,7 +275,7 @@ def make_points(
     vol = (volume[:, None] * weights).ravel()
     first = space.mesh.mesh.topology.index_map(d).local_range[0]
     layout, each = space.layout, len(weights)
-    nodes = _free_nodes(space)[V.dofmap.list[:cells]]
+    nodes = free_nodes(space)[V.dofmap.list[:cells]]
     law = effect.law if energy is None else energy.law
     B = make_gradient(layout.comm, space.gradients(at), nodes, (layout.n_local, layout.n_e))
     cell = np.repeat(np.arange(first, first + cells), each)
@@ -290,7 +290,7 @@ def quadrature(space: Discretisation) -> tuple[Array, Array, int]:
     return *basix.make_quadrature(element.cell_type, degree), degree
 
 
-def _free_nodes(space: Discretisation) -> np.ndarray:
+def free_nodes(space: Discretisation) -> np.ndarray:
     """Number among all free nodes of each local node, ghosts included; -1 where it follows the hand. Collective."""
     d, layout = space.layout.dimension, space.layout
     numbers = np.repeat(layout.start // d + np.arange(len(space.free), dtype=float), d)

@@ -1,41 +1,61 @@
-"""The free boundary of the tissue: the nodes that obstacles can touch, the same on every rank."""
+"""The free boundary of the tissue: the nodes and points that obstacles can touch, the same on every rank."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import dolfinx.mesh
 import numpy as np
+import scipy.sparse
 from mpi4py import MPI
 from numpy.typing import NDArray
 
 from softgrasp.fem.model.assembly import Discretisation
+from softgrasp.fem.model.contact import rigid_modes
+from softgrasp.fem.model.points import Parts, facet_points
 from softgrasp.fem.petsc import Array, rows_on_all, total
 from softgrasp.fem.system import BlockSystem
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Nodes of the boundary that do not follow the hand, in the order of their numbers."""
+    """Nodes of the boundary that do not follow the hand, in the order of their numbers, and points after them."""
 
     comm: MPI.Intracomm  # ranks of the tissue
-    X: Array  # coordinates at rest, (p, d) [m]
+    X: Array  # coordinates of the points at rest, the m nodes first, (p, d) [m]
     T: Array  # rigid modes of the hand there, (p d, n_s) [1, m]
-    dofs: NDArray[np.intp]  # numbers among all tissue unknowns, (p d,)
+    dofs: NDArray[np.intp]  # numbers of the nodes' unknowns among all tissue unknowns, (m d,)
     mine: NDArray[np.intp]  # places here of the unknowns that this rank owns
     rows: NDArray[np.intp]  # rows of those among the owned ones
+    B: Any = None  # values of the nodes' shape functions at all points (p, m), sparse; None: nodes alone
 
     def places(self, q: Array, z: Array | float = 0.0) -> Array:
-        """Coordinates of the nodes with the hand at q (n_s,) and displacements z (p d,) of the tissue, (p, d) [m]."""
+        """Coordinates of the points with the hand at q (n_s,) and displacements z (p d,) of the tissue, (p, d) [m]."""
         return self.X + (z + self.T @ q).reshape(self.X.shape)
 
     def gather(self, x: Array) -> Array:
-        """Values (p d,) of a vector given by its owned rows. Collective."""
+        """Values at the points (p d,) of a vector given by its owned rows. Collective."""
         if self.comm.size == 1:
-            return x[self.rows]
+            return self.at_points(x[self.rows])
         part = np.zeros(len(self.dofs))
         part[self.mine] = x[self.rows]
-        return total(self.comm, part)
+        return self.at_points(total(self.comm, part))
+
+    def at_points(self, x: Array) -> Array:
+        """Values at the points (p d,) of values (m d,) at the nodes."""
+        return x if self.B is None else np.asarray(self.B @ x.reshape(self.B.shape[1], -1)).ravel()
+
+    def on_nodes(self, f: Array) -> Array:
+        """Forces (m d,) on the nodes of forces (p d,) on the points."""
+        return f if self.B is None else np.asarray(self.B.T @ f.reshape(self.B.shape[0], -1)).ravel()
+
+    def weights(self, points: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array]:
+        """Nodes (k,) on which forces on points (n,) act, and the share of each point in them, (n, k)."""
+        assert self.B is not None
+        rows = self.B[points]
+        nodes = np.unique(rows.indices)
+        return nodes, rows[:, nodes].toarray()
 
 
 def node_distance(space: Discretisation) -> float:
@@ -47,19 +67,19 @@ def node_distance(space: Discretisation) -> float:
     return float(longest / space.V.element.basix_element.degree)
 
 
-def make_surface(space: Discretisation, system: BlockSystem) -> Surface:
-    """The free boundary of a model. Collective."""
+def make_surface(space: Discretisation, system: BlockSystem, parts: Parts | None = None) -> Surface:
+    """The free boundary of a model: its nodes, and with ``parts`` points that divide edges of facets. Collective."""
     layout = system.layout
     nodes = np.flatnonzero(space.surface()[0])
     rows = (nodes[:, None] * layout.dimension + np.arange(layout.dimension)).ravel()
     dofs = rows_on_all(layout.comm, layout.start + rows)
     first = sum(layout.comm.allgather(len(rows))[: layout.comm.rank])
     mine = np.arange(first, first + len(rows))
-    return Surface(
-        comm=layout.comm,
-        X=rows_on_all(layout.comm, layout.nodes[nodes]),
-        T=rows_on_all(layout.comm, system.T[rows]),
-        dofs=dofs,
-        mine=mine,
-        rows=rows,
-    )
+    X, T, B = rows_on_all(layout.comm, layout.nodes[nodes]), rows_on_all(layout.comm, system.T[rows]), None
+    if parts is not None:
+        d = layout.dimension
+        places, B = facet_points(space, dofs[::d] // d, parts)
+        modes = rigid_modes(places, d, T.shape[1] > d, layout.reference)
+        B = scipy.sparse.vstack([scipy.sparse.eye_array(len(X)), B], format="csr") if len(places) else None
+        X, T = np.vstack([X, places]), np.vstack([T, modes])
+    return Surface(layout.comm, X, T, dofs, mine, rows, B)

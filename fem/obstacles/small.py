@@ -6,6 +6,8 @@ that stops to help. `contact.c` keeps the factor of the set; without a compiler 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,11 @@ Array = NDArray[Any]
 MOST = 40  # rounds for each row, at most: few problems take ten in all
 
 
+SHARES = 1e-10, 1e-8, 1e-6, 1e-4  # of the diagonal, that make dependent rows definite: the least that leads to an end
+SOON = 2  # rounds for each row of such a problem before the next share
+PASSES = 200  # until the share is without effect; three are usual
+
+
 class SmallProblem:
     """The problem with its last set; W may grow by rows between the calls.
 
@@ -27,6 +34,8 @@ class SmallProblem:
         rounds: since the start [1].
         changes: rows that changed sides since the start [1].
     """
+
+    most = MOST
 
     def __init__(self, engine: str = "") -> None:
         """``engine``: "C" or "NumPy"; empty takes C where there is a compiler. Raises SolverError: there is none."""
@@ -90,7 +99,7 @@ class SmallProblem:
         failed = self._in_numpy(p, W, q, tol) if self.code is None else self._in_c(p, W, q, tol)
         if failed:
             raise SolverError(
-                f"the contact problem of {p} rows has no solution that {MOST * p} rounds find; obstacles that "
+                f"the contact problem of {p} rows has no solution that {self.most * p} rounds find; obstacles that "
                 "leave the tissue no room are the usual reason: move one, or take more time.steps"
             )
         return self.x[:p]
@@ -99,7 +108,7 @@ class SmallProblem:
         assert self.code is not None
         at = self.code[0].from_buffer
         result: int = self.code[1].softgrasp_complement(
-            p, len(W), at("double[]", W), at("double[]", q), tol, MOST * p, *self.kept
+            p, len(W), at("double[]", W), at("double[]", q), tol, self.most * p, *self.kept
         )
         return result
 
@@ -108,7 +117,7 @@ class SmallProblem:
         inside = np.zeros(p, dtype=bool)
         inside[self.active] = True
         best, tries = p + 1, RETRIES
-        for _ in range(MOST * p):
+        for _ in range(self.most * p):
             self.tally[0] += 1
             rows, x = np.flatnonzero(inside), np.zeros(p)
             block = W[np.ix_(rows, rows)]
@@ -130,3 +139,69 @@ class SmallProblem:
             inside ^= wrong
         self.count[0] = 0
         return -1
+
+
+class DependentProblem(SmallProblem):
+    """The problem of rows that depend on each other, as those of points between nodes do.
+
+    W is singular, x not unique while W x is. Proximal passes x <- solution for W + E and q - E x, E a share of the
+    diagonal of W, end at a solution of the problem itself [Rockafellar76].
+    """
+
+    most = SOON
+
+    def restart(self, W: Array, active: Array) -> None:
+        """See :meth:`SmallProblem.restart`."""
+        with _raised(W, len(W), SHARES[0]):
+            super().restart(W, active)
+
+    def solve(self, p: int, W: Array, q: Array, tol: float) -> Array:
+        """See :meth:`SmallProblem.solve`."""
+        for share in SHARES:
+            try:
+                if share > SHARES[0]:
+                    self._guess(p, W, q, share)
+                x = self._passes(p, W, q, tol, share)
+            except SolverError:
+                if share == SHARES[-1]:
+                    raise
+                continue
+            if share > SHARES[0]:
+                self.count[0] = 0  # the factor is that of another matrix
+            return x
+        raise AssertionError
+
+    def _guess(self, p: int, W: Array, q: Array, share: float) -> None:
+        """Begin from the set that non-negative least squares find [LH74]: slower, and without a cycle."""
+        from scipy.linalg import solve_triangular  # few steps need it
+        from scipy.optimize import nnls
+
+        with _raised(W, p, share):
+            try:
+                L = np.linalg.cholesky(W[:p, :p])
+                active = np.flatnonzero(nnls(L.T, -solve_triangular(L, q[:p], lower=True))[0])
+            except (np.linalg.LinAlgError, RuntimeError):
+                active = np.zeros(0, dtype=np.intp)
+            super().restart(W, active)
+
+    def _passes(self, p: int, W: Array, q: Array, tol: float, share: float) -> Array:
+        x, right = np.zeros(p), q.copy()
+        with _raised(W, p, share) as more:
+            for _ in range(PASSES):
+                right[:p] = q[:p] - more * x
+                before, x = x, super().solve(p, W, right, tol / 2).copy()
+                if np.abs(more * (x - before)).max(initial=0.0) <= tol / 2:
+                    return x
+        raise SolverError(f"contact: {PASSES} passes leave the forces of {p} points open; take fewer obstacle.parts")
+
+
+@contextmanager
+def _raised(W: Array, p: int, share: float) -> Iterator[Array]:
+    """W with a diagonal of its first p rows that is larger by a share; yields by how much, (p,)."""
+    every = np.arange(p)
+    diagonal = W[every, every]
+    W[every, every] += (more := share * diagonal)
+    try:
+        yield more
+    finally:
+        W[every, every] = diagonal

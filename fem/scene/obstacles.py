@@ -62,6 +62,12 @@ class Obstacle(Section):
     friction: NonNegative = Field(
         0.0, description="Coulomb coefficient of friction [1], >= 0; with effects.obstacles; 0: none"
     )
+    parts: Annotated[int, Field(ge=1, le=64)] | None = Field(
+        None,
+        description="parts of a boundary edge between points that can touch, 1: nodes alone [1]; with "
+        "effects.obstacles; default: nodes, and more where the obstacle is smaller than their distance or, in 3D, on "
+        "order 2",
+    )
     path: Dropped[Path] = Field(None, description="translation over time {velocity [m/s] or csv}; fixed unless given")
 
     @model_validator(mode="after")
@@ -72,6 +78,8 @@ class Obstacle(Section):
                 needed = " and ".join(keys)
                 state = "is missing" if key in keys else f"does not go with kind = '{self.kind}'"
                 raise ValueError(f"{key} {state}; a {self.kind} takes {needed}")
+        if self.friction and self.parts is not None:
+            raise ValueError("parts cannot go with friction, which acts on nodes alone; drop one of them")
         if self.normal is not None and not any(self.normal):
             raise ValueError(f"normal is {self.normal}; it must have a direction")
         if self.lo is not None and self.hi is not None:

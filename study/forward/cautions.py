@@ -73,12 +73,18 @@ def small_obstacles(model: Model) -> list[str]:
         return []
     from softgrasp.fem.model.surface import node_distance  # only scenes with contact pay for it
     from softgrasp.fem.obstacles import make_obstacles
+    from softgrasp.fem.obstacles.spacing import edge_parts
 
-    between = node_distance(model.space)
+    layout, entries = model.system.layout, model.scene.obstacle or []
+    longest = node_distance(model.space) * layout.order
+    parts = edge_parts(entries, layout.order, layout.dimension)
+    divided = 1 if parts is None else int(parts(np.array([longest]))[0])
+    between, what = longest / max(divided, layout.order), "nodes" if divided == 1 else "points"
     return [
         f"Obstacle '{o.name}' is {size:.2g} m {'in radius' if o.kind in ('disc', 'ball') else 'thick'}, less than the "
-        f"{between:.2g} m between boundary nodes: only nodes touch, so it can sink in between two; take smaller cells."
-        for o in make_obstacles(model.scene, model.system.layout.dimension)
+        f"{between:.2g} m between boundary {what}: only {what} touch, so it can sink in between two; take "
+        + ("smaller cells." if entry.friction else "smaller cells, or more obstacle.parts.")
+        for o, entry in zip(make_obstacles(model.scene, layout.dimension), entries, strict=True)
         if (size := o.shape.size()) < between * (1 - 1e-9)  # edges of equal cells differ by rounding
     ]
 

@@ -82,7 +82,7 @@ class FiniteContact(Contact):
             f0 = self._strengths(before, m)
             rows.x = self.small.solve(len(q), W, q - C @ self.responses.G[:m, :m] @ f0, tol / 4).copy()
             f = C.T @ rows.x
-            pressing[self.places] = self.responses.forces(f)[self.order]
+            pressing[self.places] = self.surface.on_nodes(self.responses.forces(f))[self.order]
             midpoint.press(pressing, self.responses.columns[:, :m] @ (f - f0), count < BALANCED)
             before, pressed = rows, rows.x > 0
             active[:] = False

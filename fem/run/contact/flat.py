@@ -51,9 +51,10 @@ class FlatContact(Contact):
         """Fill the struct of `contact.c`."""
         m, f, table, (obstacles, d), size = self.midpoint, self.f, self.table, self.normals.shape, self.p * self.d
         at = np.full(size, -1, np.intc)
-        at[self.order] = self.places
+        if self.surface.B is None:
+            at[self.order] = self.places
         f.p, f.d, f.n_s, f.obstacles, f.m = self.p, d, self.layout.n_s, obstacles, self.along.shape[1] - 1
-        f.n, f.whole, f.k = len(m.w_array), self.whole or self.layout.comm.size == 1, 0
+        f.n, f.whole, f.k = len(m.w_array), at.min(initial=0) >= 0, 0
         self.v, self.q, self.qdot = np.zeros(size), np.zeros(f.n_s), np.zeros(f.n_s)
         self.level, self.rate, self.least = self.offsets.copy(), np.zeros((obstacles, d)), np.zeros(obstacles)
         self.q0, self.slide = np.zeros(f.n_s), np.zeros((obstacles, d))
@@ -110,6 +111,7 @@ class FlatContact(Contact):
             return
         self.c.softgrasp_begin(self.f)
         self._settle_flat(n, tol, drive)
+        self._add_between()
         self.c.softgrasp_account(self.f, n)
 
     def _settle_flat(self, n: int, tol: float, drive: Driven) -> None:
@@ -171,6 +173,8 @@ class FlatContact(Contact):
     def finish(self, state: TissueState) -> None:
         """See :meth:`Contact.finish`. Collective."""
         self.c.softgrasp_carry(self.f, self.n, self.pressed)
+        if self.surface.B is not None:
+            self._carry_between(state)
         if not self.pressed:
             return
         assert self.drive is not None
@@ -183,6 +187,20 @@ class FlatContact(Contact):
         still = max(STILL * self.fastest, self.s * self.tol)
         if most > still:
             self._halt_flat(state, n, still)
+
+    def _add_between(self) -> None:
+        """Give r the forces on points, which are not on single unknowns. Collective."""
+        if self.surface.B is not None:
+            self.forces = self.pressing().ravel()
+            self._add_to_r()
+
+    def _carry_between(self, state: TissueState) -> None:
+        """Carry the points on to the bits that a restart finds, and r with them. Collective."""
+        self.z[:], self.moved[:] = self.surface.gather(state.z.array_r), 0.0
+        self.c.softgrasp_look(self.f)
+        self.gaps[:], self.table.gap[self.n + 1] = self.after, self.least
+        if self.pressed:
+            self._add_to_r()
 
     def _halt_flat(self, state: TissueState, n: int, still: float) -> None:
         """The impulse on pressed rows, one of which is faster than ``still``. Collective."""

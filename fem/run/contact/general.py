@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 from softgrasp.fem.errors import SceneError, SolverError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.contact import rigid_modes
-from softgrasp.fem.model.surface import make_surface
+from softgrasp.fem.model.surface import Surface, make_surface
 from softgrasp.fem.obstacles import HalfSpace, make_obstacles
 from softgrasp.fem.obstacles.obstacle import Obstacle, check_passage, mean_normal
 from softgrasp.fem.obstacles.responses import Responses
-from softgrasp.fem.obstacles.small import SmallProblem
+from softgrasp.fem.obstacles.small import DependentProblem, SmallProblem
+from softgrasp.fem.obstacles.spacing import edge_parts
 from softgrasp.fem.petsc import Array, rows_on_all
 from softgrasp.fem.run.contact.record import ContactRecord, Tables
 from softgrasp.fem.run.contact.rows import Flags, Ints, Rows
@@ -51,6 +52,13 @@ def unsettled(reached: float) -> SolverError:
     )
 
 
+def contact_surface(model: Model) -> Surface:
+    """The free boundary with the points at which it meets the obstacles of the scene. Collective."""
+    layout = model.system.layout
+    parts = edge_parts(model.scene.obstacle or [], layout.order, layout.dimension)
+    return make_surface(model.space, model.system, parts)
+
+
 class Contact:
     """Contact of one run. Making one is collective; its calls in a step as well where the tissue is distributed.
 
@@ -68,17 +76,17 @@ class Contact:
         self.system, self.midpoint, self.layout, self.hand = system, midpoint, system.layout, hand
         self.dt, self.s = midpoint.dt, midpoint.s
         self.obstacles = make_obstacles(model.scene, self.layout.dimension)
-        self.surface = make_surface(model.space, system)
+        self.surface = contact_surface(model)
         self.p, self.d = self.surface.X.shape
         self.table = Tables.empty(steps, len(self.obstacles), self.d, self.layout.n_s)
         self.whole, places = midpoint.operators.whole, self.surface.rows
         if self.whole:
             places = np.argsort(midpoint.operators.enter(np.arange(self.layout.n_e)))[self.surface.dofs]
-        self.places: Ints = places  # of the boundary's unknowns on the rows here
+        self.places: Ints = places  # of the boundary nodes' unknowns on the rows here
         self.order: Any = slice(None) if self.whole else self.surface.mine  # which of them lie there
         held = rows_on_all(self.layout.comm, self.layout.held)
         self.held, self.held_T = held, rigid_modes(held, self.d, model.scene.effects.rotation, self.layout.reference)
-        self.small = SmallProblem()
+        self.small = self.make_problem()
         self.z, self.moved, self.forces = (np.zeros(self.p * self.d) for _ in range(3))
         self.gaps = self.after = np.zeros((len(self.obstacles), self.p))
         self.fastest = 0.0  # largest velocity of a boundary node in a step with contact [m/s]
@@ -105,14 +113,22 @@ class Contact:
         """S^-1 of forces on the boundary. Collective."""
         b = self.b.array_w
         b[:] = 0.0
-        b[self.places] = force[self.order]
+        b[self.places] = self.surface.on_nodes(force)[self.order]
         self.midpoint.solver.solve(self.b, self.y)
         column = self.y.array_r
         return column, self._take(column)
 
     def _take(self, x: Array) -> Array:
         """Values on the boundary of a vector on the rows here. Collective."""
-        return x[self.places] if self.whole else self.surface.gather(x)
+        return self.surface.at_points(x[self.places]) if self.whole else self.surface.gather(x)
+
+    def make_problem(self) -> SmallProblem:
+        """A small problem for rows of this boundary."""
+        return SmallProblem() if self.surface.B is None else DependentProblem()
+
+    def _add_to_r(self) -> None:
+        """Give r the forces on the boundary. Collective."""
+        self.midpoint.r.array_w[self.places] += self.surface.on_nodes(self.forces)[self.order]
 
     def _gaps(self, x: Array, n: int) -> Array:
         return np.array([o.gap(x, n * self.dt) for o in self.obstacles])
@@ -142,7 +158,7 @@ class Contact:
             o, i = np.unravel_index(self.gaps.argmin(), self.gaps.shape)
             place = ", ".join(f"{c:.4g}" for c in x[i])
             raise SceneError(
-                f"obstacle '{self.obstacles[o].name}' holds the node of the tissue at ({place}) m at the start, "
+                f"obstacle '{self.obstacles[o].name}' holds the point of the tissue at ({place}) m at the start, "
                 f"{-self.gaps[o, i]:.3g} m deep; move it, or start elsewhere"
             )
 
@@ -244,10 +260,10 @@ class Contact:
     def _add(self, n: int, f: Array, drive: Driven) -> None:
         """Take forces f into the step of tissue and hand. Collective."""
         midpoint = self.midpoint
-        w, r = midpoint.w.array_w, midpoint.r.array_w  # PETSc sees that they change
+        w = midpoint.w.array_w  # PETSc sees that it changes
         w += self.responses.columns[:, : len(f)] @ f
         self.forces = self.responses.forces(f)
-        r[self.places] += self.forces[self.order]
+        self._add_to_r()
         self._push_hand(n, f, drive)
         self.moved = self._take(midpoint.w_array)
 
@@ -271,7 +287,9 @@ class Contact:
         n = self.n
         self.z += 2 * self.moved
         self.gaps = self.after
-        if len(self.rows.node):
+        if self.surface.B is not None:
+            self.z = self.surface.gather(state.z.array_r)
+        if len(self.rows.node) or self.surface.B is not None:
             assert self.drive is not None
             self.gaps = self._gaps(self.surface.places(self.drive.q[n + 1], self.z), n + 1)  # the bits of a restart
         self.table.gap[n + 1] = self.gaps.min(axis=1)
@@ -281,7 +299,7 @@ class Contact:
 
     def _carry(self) -> None:
         """Give r the forces once more, which it lacks as it lacks G c. Collective."""
-        self.midpoint.r.array_w[self.places] += self.forces[self.order]
+        self._add_to_r()
 
     def _stop(self, state: TissueState, n: int) -> None:
         """The inelastic impulse on pressed nodes at the end of step n. Collective."""

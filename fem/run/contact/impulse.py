@@ -16,6 +16,7 @@ from scipy.linalg import cho_factor, cho_solve
 from softgrasp.fem.model.surface import Surface
 from softgrasp.fem.obstacles.compiled import RIDGE
 from softgrasp.fem.obstacles.mass import NodalMass
+from softgrasp.fem.obstacles.small import SHARES
 from softgrasp.fem.petsc import Array, to_scipy, whole_copy
 from softgrasp.fem.system import BlockSystem
 
@@ -62,7 +63,7 @@ class Impulses:
         first = system.layout.start
         self.X = X[first : first + self.n]
         self.H = system.M_hand + system.M_rigid - total(comm, system.G.T @ self.X)
-        self.reach = self.surface.T - X[self.surface.dofs]
+        self.reach = self.surface.T - np.column_stack([self.surface.at_points(x) for x in X[self.surface.dofs].T])
 
     def matrix(self, nodes: Ints, directions: Array) -> Array:
         """A (k, k) [1/kg] of unit impulses on boundary nodes (k,) along unit vectors (k, d); kept for the same ones.
@@ -71,15 +72,23 @@ class Impulses:
         """
         key = nodes.tobytes() + directions.tobytes()
         if key != self.key:
-            numbers = self.numbers[nodes]
-            self.mass.enter(numbers)
-            at = self.mass.where[numbers]
-            self.A = self.mass.block[np.ix_(at, at)] * (directions @ directions.T)
+            at, shares = self._at(nodes)
+            block = self.mass.block[np.ix_(at, at)]
+            self.A = (block if shares is None else shares @ block @ shares.T) * (directions @ directions.T)
             if self.n_s:
                 B = self._reach(nodes, directions)
                 self.A += B @ np.linalg.solve(self.H, B.T)
             self.key, self.factor = key, (np.zeros((0, 0)), True)
         return self.A
+
+    def _at(self, points: Ints) -> tuple[Ints, Array | None]:
+        """Columns (m,) of the nodes on which points (k,) act, and the share of each point (k, m); None: one node each.
+
+        Raises SolverError: see `matrix`.
+        """
+        nodes, shares = (points, None) if self.surface.B is None else self.surface.weights(points)
+        self.mass.enter(self.numbers[nodes])
+        return self.mass.where[self.numbers[nodes]], shares
 
     def _reach(self, nodes: Ints, directions: Array) -> Array:
         """B, (k, n_s)."""
@@ -89,22 +98,26 @@ class Impulses:
         """Impulses y (k,) [N s] with A y = b, b (k,) [m/s]; equal rows share them. Raises SolverError: see `matrix`."""
         A = self.matrix(nodes, directions)
         if not len(self.factor[0]):
-            ridged = A + RIDGE * np.diag(A.diagonal())
+            ridge = RIDGE if self.surface.B is None else SHARES[0]
+            ridged = A + ridge * np.diag(A.diagonal())
             self.factor = cho_factor(ridged, lower=True, overwrite_a=True, check_finite=False)
         y = cho_solve(self.factor, b, check_finite=False)
-        return np.asarray(y + cho_solve(self.factor, b - A @ y, check_finite=False))  # without the ridge's error
+        for _ in range(1 if self.surface.B is None else 4):  # without the ridge's error
+            y += cho_solve(self.factor, b - A @ y, check_finite=False)
+        return np.asarray(y)
 
     def jump(self, nodes: Ints, directions: Array, y: Array) -> tuple[Array, Array, Array]:
         """Jump of the velocity (n_local,) [m/s], that of the hand (n_s,), and what the momentum gains, M u (n_local,).
 
         For impulses y (k,) [N s] on the nodes and directions of the last `matrix`.
         """
-        total, at = np.zeros((len(self.mass.nodes), self.d)), self.mass.where[self.numbers[nodes]]
-        np.add.at(total, at, y[:, None] * directions)
+        each, (at, shares) = y[:, None] * directions, self._at(nodes)
+        total = np.zeros((len(self.mass.nodes), self.d))
+        np.add.at(total, at, each if shares is None else shares.T @ each)
         u, gained = (self.mass.columns @ total).ravel(), np.zeros(self.n)
         forces = np.zeros(self.surface.X.shape)
-        np.add.at(forces, nodes, y[:, None] * directions)
-        gained[self.surface.rows] = forces.ravel()[self.surface.mine]
+        np.add.at(forces, nodes, each)
+        gained[self.surface.rows] = self.surface.on_nodes(forces.ravel())[self.surface.mine]
         if not self.n_s:
             return u, np.zeros(0), gained
         a = np.linalg.solve(self.H, self._reach(nodes, directions).T @ y)

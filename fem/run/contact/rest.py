@@ -12,7 +12,6 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.obstacles.responses import Responses
-from softgrasp.fem.obstacles.small import SmallProblem
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Time
 from softgrasp.fem.solve.solvers import choose_solver
@@ -37,7 +36,7 @@ def resting(contact: Contact, q: Array, time: Time) -> Array:
 
         def respond(force: Array) -> tuple[Array, Array]:
             b = np.zeros((layout.n_local, 1))
-            b[surface.rows, 0] = force[surface.mine]
+            b[surface.rows, 0] = surface.on_nodes(force)[surface.mine]
             column = factor.columns(b, "the response to an obstacle")[:, 0]
             return column, surface.gather(column)
 
@@ -47,7 +46,7 @@ def resting(contact: Contact, q: Array, time: Time) -> Array:
 
 def _forces(contact: Contact, responses: Responses, q: Array, free: Array) -> Array:
     """What the forces of the obstacles add to z, (n_local,), given z on the boundary without them. Collective."""
-    surface, z, small = contact.surface, free, SmallProblem()
+    surface, z, small = contact.surface, free, contact.make_problem()
     known = np.zeros((len(contact.obstacles), contact.p), dtype=bool)
     pressed, limit, f, moved = known.copy(), 0.0, np.zeros(0), 0.0
     for _ in range(MOST):

@@ -33,6 +33,8 @@ REFUSED = [
         "{kind='polygon', points=[[0, 0], [4, 0], [0, 4], [1, 1]]}",
         "obstacle.0.points[3] = [1.0, 1.0] is no corner of the convex hull of all points",
     ),
+    (f"{{{TABLE}, parts=0}}", "obstacle.0.parts is 0; it must be >= 1"),
+    (f"{{{TABLE}, parts=2, friction=0.1}}", "obstacle.0.parts cannot go with friction, which acts on nodes alone"),
     (f"{{{TABLE}, path={{}}}}", "obstacle.0.path.velocity or csv must be given, and not both"),
     (f"{{{TABLE}, path={{velocity=[1, 0, 0]}}}}", "obstacle.0.path.velocity has a vector of 3 entries"),
     (f"{{{TABLE}}}, {{{TABLE}, name='halfspace1'}}", "obstacle.0 and obstacle.1 are both named halfspace1"),

@@ -68,7 +68,9 @@ def test_reduction_refuses_contact() -> None:
     ],
 )
 def test_an_obstacle_that_is_small_against_an_edge_is_warned_of(obstacle: str, order: int, size: str) -> None:
-    model = build("paper_forward", [*SCENE[:-1], f"tissue.order={order}", f"obstacle=[{{name='pin', {obstacle}}}]"])
+    scene = [*SCENE[:-1], f"tissue.order={order}"]
+    assert not small_obstacles(build("paper_forward", [*scene, f"obstacle=[{{name='pin', {obstacle}}}]"]))
+    model = build("paper_forward", [*scene, f"obstacle=[{{name='pin', {obstacle}, parts=1}}]"])
     expected = f"Obstacle 'pin' is {size}, less than the {0.25 / order:.2g} m between boundary nodes"
     texts = small_obstacles(model)
     assert [text.partition(":")[0] for text in texts] == ([expected] if size else [])
@@ -94,7 +96,7 @@ def test_explain_advises_to_drop_obstacles_that_the_path_stays_clear_of(offset: 
 
 
 def test_a_run_begins_with_the_warning_of_a_small_obstacle(tmp_path: Path) -> None:
-    pin = "obstacle=[{name='pin', kind='disc', center=[0.5, -0.5], radius=0.1}]"
+    pin = "obstacle=[{name='pin', kind='disc', center=[0.5, -0.5], radius=0.1, parts=2}]"
     console = Console(record=True, quiet=False, file=io.StringIO())
     result = run_simulate(Path("paper_forward"), tmp_path, [*SCENE[:-1], pin], console, pictures=False)
     assert sum("Obstacle 'pin' is 0.1 m in radius" in text for text in result["warnings"]) == 1
