@@ -5,7 +5,8 @@
 y_t half the slip of the step; a node has one tangent in 2D and two in 3D. Newton's method on the sets open, stick and
 slip [AC91]: in 2D it is exact when the sets stay, in 3D the directions of slipping nodes converge with it. Its factor
 stays while few rows of the matrix are others: those are taken in by a small matrix of their own. Where the method comes
-back to sets seen before, sweeps of Gauss-Seidel over the nodes find others. `friction.c` does so; without a compiler
+back to sets seen before, sweeps of Gauss-Seidel over the nodes find others; then pivots do (`lemke.py`), which in 2D
+always end at a solution, or friction that grows. `friction.c` does so; without a compiler
 NumPy takes the same rounds, each with a factor of its own.
 """
 
@@ -29,6 +30,7 @@ SWEEPS = 3000
 STILL = 1e-14  # change of the forces by a sweep over the largest, at which sweeps end
 LITTLE = 0.2  # first coefficient of friction that grows
 GROWTH, LEAST = 1.4, 1.04  # by how much it does, and by how much it must
+NEARLY = 1e-9  # of a force, below which its node slips, or is open [1]
 SOLVED, WANTED = 0, 1  # what `softgrasp_rub` says; else the rounds lead nowhere
 SOURCE = Path(__file__).with_name("friction.c")
 DECLARATIONS = """
@@ -119,22 +121,47 @@ class Coulomb:
             mu: coefficients of friction, (k,).
             tol: by how much gaps may be negative, and slips of the wrong sign [m].
 
-        Raises SolverError: neither rounds nor sweeps find a solution, nor does friction that grows.
+        Raises SolverError: neither rounds nor sweeps find a solution, nor do pivots or friction that grows.
         """
         if k != len(self.kind):
             self.fit(k)
         opened = (self.kind == OPEN) & (q[:: 1 + self.m] < 0)
         self.kind[opened] = STICK
-        if not (self._attempt(W, q, mu, tol) or self._grow(W, q, mu, tol)):
-            raise SolverError(
-                f"the friction of {k} nodes has no solution that {SWEEPS} sweeps find; take more time.steps, or "
-                "less friction"
-            )
+        if not self._attempt(W, q, mu, tol):
+            others = (self._pivot, self._grow) if self.m == 1 else (self._grow, self._pivot)
+            if not any(other(W, q, mu, tol) for other in others):
+                raise SolverError(
+                    f"the friction of {k} nodes has no solution that {SWEEPS} sweeps find; take more time.steps, or "
+                    "less friction"
+                )
         return self.x
 
     def _attempt(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
         """Whether rounds and sweeps from the present forces and sets find a solution."""
         return self._in_numpy(W, q, mu, tol) if self.code is None else self._in_c(W, q, mu, tol)
+
+    def _pivot(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
+        """Whether the law with pyramids, in 2D the law itself, leads to a solution."""
+        from softgrasp.fem.obstacles.lemke import pyramid_forces  # few runs need it
+
+        K = len(q)
+        x = pyramid_forces(W[:K, :K], q, mu, self.m)
+        if x is None:
+            return False
+        self.forget()
+        self.x[:] = x
+        self._set_kinds(mu, NEARLY * float(np.abs(x).max(initial=0.0)))
+        return self._attempt(W, q, mu, tol)
+
+    def _set_kinds(self, mu: Array, small: float = 0.0) -> None:
+        """Sets and directions of the present forces, of which ``small`` ones are rounding [N]."""
+        sizes = np.linalg.norm(self.x[:, 1:], axis=1)
+        inside = sizes < mu * self.x[:, 0] * (1 - NEARLY) - small
+        self.kind[:] = np.select([self.x[:, 0] <= small, inside], [OPEN, STICK], SLIP)
+        self.e[:] = 0.0
+        self.e[:, 0] = 1.0
+        on = sizes > 0
+        self.e[on, :-1] = self.x[on, 1:] / sizes[on, None]
 
     def _grow(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
         """Whether solutions under friction that grows up to mu lead to one."""
@@ -319,12 +346,8 @@ class Coulomb:
                     x[i, 1:] *= most / size
             if np.abs(x - before).max() <= STILL * x[:, 0].max():
                 break
-        sizes = np.linalg.norm(x[:, 1:], axis=1)
-        inside = sizes < mu * x[:, 0] * (1 - 1e-9)
-        self.x[:], self.kind[:] = x, np.select([x[:, 0] <= 0, inside], [OPEN, STICK], SLIP)
-        self.e[:] = 0.0
-        self.e[:, 0] = 1.0
-        self.e[sizes > 0, :-1] = x[sizes > 0, 1:] / sizes[sizes > 0, None]
+        self.x[:] = x
+        self._set_kinds(mu)
         if self.m > 1:
             self._classify(w, (W @ x.ravel() + q).reshape(k, s), mu, 0.0)
 

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
 from softgrasp.fem.errors import Paused, SceneError, SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.obstacles.coulomb import Coulomb
+from softgrasp.fem.obstacles.lemke import pyramid_forces
 from softgrasp.fem.run.contact.friction import FlatFriction
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.scene.file import load_scene
@@ -70,7 +72,28 @@ def test_forces_of_random_problems_meet_coulombs_conditions(mu: float, tangents:
             check_law(x, W, load, mu)
 
 
-@pytest.mark.parametrize("tangents", [1, 2])
+@pytest.mark.parametrize(("mu", "k", "ridge"), [(10.0, 12, 0.02), (100.0, 12, 0.02), (100.0, 30, 0.1)])
+def test_in_two_dimensions_pivots_find_forces_for_any_friction(
+    mu: float, k: int, ridge: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Loads under which rounds and sweeps lead nowhere, as do a third of them under friction that grows."""
+    solved, pivot = list[bool](), Coulomb._pivot
+    monkeypatch.setattr(Coulomb, "_pivot", lambda *arguments: (solved.append(pivot(*arguments)), solved[-1])[1])
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        A = rng.standard_normal((2 * k + 2, 2 * k))
+        W, q = A.T @ A / k + ridge * np.eye(2 * k), rng.standard_normal(2 * k)
+        check_law(Coulomb(1).solve(k, W, q, np.full(k, mu), 1e-13), W, q, mu)
+    assert len(solved) >= 4  # 10 to 15 seen
+    assert all(solved)
+
+
+def test_a_large_problem_is_left_to_friction_that_grows() -> None:
+    k = 400
+    assert pyramid_forces(np.eye(2 * k), np.ones(2 * k), np.ones(k), 1) is None
+
+
+@pytest.mark.parametrize("tangents", [2])
 def test_much_friction_is_found_from_little(tangents: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Loads under which rounds and sweeps from no forces lead nowhere: a tenth of them, rounding decides which."""
     grown, grow, refused = list[int](), Coulomb._grow, 0
@@ -145,6 +168,16 @@ def test_balance_closes_and_friction_dissipates(overrides: list[str]) -> None:
     assert result.contact.penetration < 1e-12  # curved obstacles iterate to 64 rounding units of the coordinates
     assert result.contact.rubbed > (1e-6 if "5.0" not in overrides[0] and overrides[1] == SIDE else -1e-15)
     assert result.contact.stopped >= 0
+
+
+@pytest.mark.ranks(3)
+def test_ranks_agree_on_friction_in_two_dimensions() -> None:
+    spread = run(BETA, table(0.4), SIDE)
+    alone = simulate(build("paper_forward", [*SMALL, BETA, table(0.4), SIDE], comm=MPI.COMM_SELF))
+    assert spread.contact.force == pytest.approx(alone.contact.force, abs=1e-9)  # of 10 N: rounding over 120 steps
+    assert spread.contact.rubbed == pytest.approx(alone.contact.rubbed, rel=1e-9)
+    assert spread.contact.rubbed > 1e-3
+    assert spread.outputs == pytest.approx(alone.outputs, abs=1e-10)
 
 
 def test_no_friction_is_the_run_without_the_key_bit_for_bit() -> None:
