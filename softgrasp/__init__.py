@@ -87,6 +87,8 @@ def __getattr__(name: str) -> Any:
         value = getattr(import_module(f"softgrasp.{_FACE[name]}"), name)
         globals()[name] = value
         return value
+    if name == "bridges":
+        return import_module("softgrasp.reduction.bridges")
     if name in ("fem", "reduction", "lqr", "study"):
         return import_module(f"softgrasp.{name}")
     raise AttributeError(f"module 'softgrasp' has no attribute {name!r}; it has {', '.join(__all__)}")

@@ -249,7 +249,7 @@ def test_long_command_runs_as_it_stands(line: str, tmp_path: Path, monkeypatch: 
 def test_python_of_a_page_runs(name: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from softgrasp.reduction.bases.registry import METHODS
 
-    for package in re.findall(r"^import (jax|torch)$", text, re.MULTILINE):
+    for package in re.findall(r"^import (jax|torch|mujoco)$", text, re.MULTILINE):
         pytest.importorskip(package, reason=f"{package} is no dependency, and not installed here")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "demos").symlink_to(ROOT / "demos")

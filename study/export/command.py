@@ -21,6 +21,9 @@ def export(
     fmu: Annotated[
         Path | None, typer.Option(help="write a file of FMI 3.0 for Simulink, Modelica and others, e.g. plant.fmu")
     ] = None,
+    mujoco: Annotated[
+        Path | None, typer.Option(help="write a body for MuJoCo of a model with effects.frame, e.g. hand.xml")
+    ] = None,
     tick: Annotated[float, typer.Option(help="time step of a model in seconds; a controller has its own")] = 1e-3,
 ) -> None:
     """Write a reduced model or a controller for other programs: C99 for a robot, an FMU for simulators.
@@ -33,9 +36,11 @@ def export(
     The FMU (FMI 3.0; of a model co-simulation and model exchange, of a controller co-simulation) contains the same C
     and a binary for this machine.
 
+    Of a model in the frame of the hand, MuJoCo reads hand and rigid tissue; sg.bridges.MujocoTissue deforms it.
+
     Example: softgrasp reduce paper_forward, then
     softgrasp export out/paper_forward-reduce/models/craig_bampton.h5 --c plant --fmu plant.fmu; make -C plant test time
     """
     from softgrasp.study.export.run import run_export
 
-    run_export(model, console(), c=c, fmu=fmu, tick=tick)
+    run_export(model, console(), c=c, fmu=fmu, mujoco=mujoco, tick=tick)

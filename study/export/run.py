@@ -12,13 +12,20 @@ from softgrasp.fem.errors import SceneError, raise_on_all_ranks
 from softgrasp.reduction.archive import load
 from softgrasp.reduction.export import write_c, write_fmu
 from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.turning.model import TurningModel
 from softgrasp.study.shell.session import list_files
 
-TARGETS = "--c FOLDER or --fmu FILE"  # options of which at least one is given
+TARGETS = "--c FOLDER, --fmu FILE or --mujoco FILE"  # options of which at least one is given
 
 
 def run_export(
-    path: Path, console: Console, *, c: Path | None = None, fmu: Path | None = None, tick: float = 1e-3
+    path: Path,
+    console: Console,
+    *,
+    c: Path | None = None,
+    fmu: Path | None = None,
+    mujoco: Path | None = None,
+    tick: float = 1e-3,
 ) -> None:
     """Write a saved model or controller for other programs, see ``softgrasp export --help``. Collective; rank 0 writes.
 
@@ -27,6 +34,7 @@ def run_export(
         console: terminal.
         c: folder of the C code; None for none.
         fmu: file of the FMU; None for none.
+        mujoco: file of the body for MuJoCo, of a model in the frame of the hand; None for none.
         tick: time between two steps of an exported model [s]; a controller has its own.
 
     Raises:
@@ -34,18 +42,23 @@ def run_export(
     """
     with raise_on_all_ranks(MPI.COMM_WORLD):
         if MPI.COMM_WORLD.rank == 0:
-            _export(path, console, c, fmu, tick)
+            _export(path, console, c, fmu, mujoco, tick)
 
 
-def _export(path: Path, console: Console, c: Path | None, fmu: Path | None, tick: float) -> None:
+def _export(path: Path, console: Console, c: Path | None, fmu: Path | None, mujoco: Path | None, tick: float) -> None:
     """Check the options, write and list the files; on rank 0."""
-    if c is None and fmu is None:
+    if c is None and fmu is None and mujoco is None:
         raise SceneError(f"softgrasp export {path}: name what to write: {TARGETS}")
     if fmu is not None and fmu.suffix != ".fmu":
         raise SceneError(
             f"--fmu {fmu}: simulators recognise an FMU by its ending; name it {fmu.with_suffix('.fmu').name}"
         )
-    files = _controller(path, console, c, fmu) if path.suffix == ".npz" else _model(path, console, c, fmu, tick)
+    if mujoco is not None:
+        files = [_mujoco(path, console, c, fmu, mujoco, tick)]
+    elif path.suffix == ".npz":
+        files = _controller(path, console, c, fmu)
+    else:
+        files = _model(path, console, c, fmu, tick)
     list_files(console, files)
     if c is not None:
         console.print(f"next: make -C {shlex.quote(str(c))} test time", soft_wrap=True, markup=False)
@@ -66,6 +79,23 @@ def _controller(path: Path, console: Console, c: Path | None, fmu: Path | None) 
     console.print(text, soft_wrap=True, markup=False)
     files = [] if c is None else write_controller(controller, c)
     return files + ([] if fmu is None else [write_controller_fmu(controller, fmu)])
+
+
+def _mujoco(path: Path, console: Console, c: Path | None, fmu: Path | None, file: Path, tick: float) -> Path:
+    """File of the body for MuJoCo. Raises SceneError: the model is none in the frame of the hand."""
+    from softgrasp.reduction.bridges import write_mujoco
+
+    model = load(path) if path.suffix != ".npz" else None
+    if not isinstance(model, TurningModel):
+        raise SceneError(
+            f"--mujoco {file}: {path} is no model in the frame of the hand; reduce a scene with effects.frame = 'hand'"
+        )
+    if c is not None or fmu is not None:
+        raise SceneError(
+            f"--mujoco {file}: a model in the frame of the hand is not written as C or FMU; drop --c, --fmu"
+        )
+    console.print(f"{path.name}: {model.name}, N = {model.N}, a step of {tick:g} s", soft_wrap=True, markup=False)
+    return write_mujoco(model, file, tick)
 
 
 def _model(path: Path, console: Console, c: Path | None, fmu: Path | None, tick: float) -> list[Path]:

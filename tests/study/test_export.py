@@ -6,6 +6,7 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import pytest
 from typer.testing import CliRunner
@@ -29,7 +30,7 @@ def test_a_saved_model_becomes_c(tmp_path: Path) -> None:
     model = sg.build("paper_forward", SMALL)
     run, file, folder = sg.simulate(model), tmp_path / "rom.h5", tmp_path / "plant"
     sg.save(sg.reduce(model, run, "craig_bampton", N=10), file)
-    with pytest.raises(SceneError, match="name what to write: --c FOLDER or --fmu FILE"):
+    with pytest.raises(SceneError, match="name what to write: --c FOLDER, --fmu FILE or --mujoco FILE"):
         export(file)
     with pytest.raises(SceneError, match=r"name it plant\.fmu"):
         export(file, "--c", folder, "--fmu", tmp_path / "plant.zip")
@@ -70,3 +71,29 @@ def test_nothing_of_it_is_loaded_unless_it_is_used() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_model_in_the_frame_of_the_hand_becomes_a_body_for_mujoco(tmp_path: Path) -> None:
+    """Its masses are those of hand and tissue; a model of small angles has none of its integrals."""
+    model = sg.build(
+        "block_3d", tissue={"cells": [1, 1, 2], "order": 1, "refine": False}, output={"snapshots": "memory"},
+        effects={"rotation": True, "frame": "hand"}, time={"steps": 20},
+    )  # fmt: skip
+    file, xml = tmp_path / "rom.h5", tmp_path / "hand.xml"
+    rom = sg.reduce(model, sg.simulate(model), "craig_bampton", N=16)
+    sg.save(rom, file)
+    export(file, "--mujoco", xml, "--tick", 2e-3)
+    root = ET.parse(xml).getroot()
+    masses = [float(entry.get("mass", "0")) for entry in root.iter("inertial")]
+    assert masses == pytest.approx([model.system.M_hand[0, 0], model.system.M_rigid[0, 0]], rel=1e-12)
+    option = root.find("option")
+    assert option is not None
+    assert (option.get("timestep"), option.get("integrator")) == ("0.002", "Euler")
+    with pytest.raises(SceneError, match="is not written as C or FMU"):
+        export(file, "--mujoco", xml, "--c", tmp_path / "plant")
+    with pytest.raises(SceneError, match="only linear reduced models are exported, of small angles"):
+        export(file, "--c", tmp_path / "plant")
+    flat = sg.build("paper_forward", SMALL)
+    sg.save(sg.reduce(flat, sg.simulate(flat), "craig_bampton", N=10), file)
+    with pytest.raises(SceneError, match="is no model in the frame of the hand"):
+        export(file, "--mujoco", xml)

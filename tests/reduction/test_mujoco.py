@@ -1,0 +1,171 @@
+"""Tissue on a body of MuJoCo: against the own two-way model, what it conserves, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import softgrasp as sg
+from softgrasp.fem.errors import ResourceError
+from softgrasp.fem.petsc import Array
+from softgrasp.reduction import online
+from softgrasp.reduction.bridges import MujocoTissue, mujoco_body, write_mujoco
+from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.system import ModelError
+from softgrasp.reduction.turning.model import TurningModel
+
+mujoco: Any = pytest.importorskip("mujoco", reason="MuJoCo is no dependency: pip install 'softgrasp[mujoco]'")
+pytestmark = pytest.mark.serial
+SLIDES = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+
+
+def reduced(effects: dict[str, Any], N: int, turns: bool = True) -> Any:
+    """A block of silicone on a Franka Hand."""
+    frame = {"rotation": True, "frame": "hand"} if turns else {"rotation": False}
+    model = sg.build(
+        "block_3d", comm=MPI.COMM_SELF, effects={"gravity": False, "reaction": True} | frame | effects,
+        tissue={"cells": [2, 2, 3], "order": 1, "refine": False, "material": "ecoflex-00-30"},
+        hand={"mass": 0.73, "inertia": [2e-3, 2e-3, 1e-3]}, output={"snapshots": "memory"},
+        motion={"target": [0.05, 0.0, 0.0, *([0.0] * 3 if turns else [])], "duration": 0.1},
+        time={"steps": 4, "end": 0.1, "start": "rest"},
+    )  # fmt: skip
+    return sg.reduce(model, sg.simulate(model), "craig_bampton", N=N)
+
+
+@pytest.fixture(scope="module")
+def rom() -> TurningModel:
+    """Twelve modes, damped."""
+    model = reduced({"damping": {"kind": "kelvin-voigt", "beta": 0.005}}, 36)
+    assert isinstance(model, TurningModel)
+    return model
+
+
+def world(body: str, h: float, gravity: str = "0 0 0", option: str = 'solver="Newton"', more: str = "") -> Any:
+    """A model of MuJoCo with the body."""
+    option = f'<option timestep="{h}" gravity="{gravity}" {option} {"" if "integrator" in option else EULER}/>'
+    return mujoco.MjModel.from_xml_string(f"<mujoco>{option}<worldbody>{body}</worldbody>{more}</mujoco>")
+
+
+EULER = 'integrator="Euler"'
+
+
+def test_of_second_order_beside_the_own_two_way_model(rom: TurningModel) -> None:
+    own = reduced({"damping": {"kind": "kelvin-voigt", "beta": 0.005}}, 30, turns=False)
+    assert isinstance(own, ReducedModel)
+
+    def force(t: Array) -> Array:
+        return np.outer(np.sin(2 * np.pi * t) * (t < 0.5), [8.0, -4.0, 3.0])
+
+    errors, fine = [], 20
+    for h in (2e-3, 1e-3, 5e-4):
+        steps = round(0.75 / h)
+        exact = online.run(own.at(), h / fine, force=force((np.arange(steps * fine) + 0.5) * h / fine)).v_s[::fine]
+        model = world(mujoco_body(rom, joint=SLIDES), h)
+        data, tissue, found = mujoco.MjData(model), MujocoTissue(rom, model, dt=h), [np.zeros(3)]
+        for load in force((np.arange(steps) + 0.5) * h):
+            data.qfrc_applied[:] = load
+            tissue.step(data)
+            found.append(data.qvel.copy())
+        errors.append(np.abs(np.array(found) - exact).max() / np.abs(exact).max())
+        assert np.array_equal(data.qfrc_applied, load)  # what the user applied stays
+    assert errors[1] <= 2e-6  # asked for; measured 1.6e-6
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.all(np.abs(orders - 2) < 0.1), (errors, orders)
+
+
+def test_a_free_body_with_tissue_keeps_what_a_rigid_one_keeps() -> None:
+    """MuJoCo's explicit gyroscopic forces are of first order; tissue adds nothing of that size."""
+    rom, h, drift = reduced({"damping": False}, 24), 1e-3, []
+    small = rom.at(h)
+    for rigid in (True, False):
+        model = world(mujoco_body(rom), h)
+        data, at = mujoco.MjData(model), mujoco.MjData(model)
+        tissue = MujocoTissue(rom, model, dt=h)
+        data.qvel[:] = [0.3, 0.1, 0.0, 2.0, 1.0, 1.2]
+        kept = []
+        for n in range(1500):
+            data.qfrc_applied[:] = [0.5, -0.3, 0.2, 0.01, 0.02, 0.0] if n < 50 else 0.0
+            if rigid:
+                mujoco.mj_step(model, data)
+            else:
+                tissue.step(data)
+            if n >= 50 and n % 25 == 0:
+                at.qpos[:], at.qvel[:] = data.qpos, data.qvel
+                mujoco.mj_forward(model, at)
+                J, Q = np.zeros((6, 6)), at.xmat[tissue.body].reshape(3, 3)
+                mujoco.mj_jacBody(model, at, J[:3], J[3:], tissue.body)
+                V, spin = Q.T @ J[:3] @ data.qvel, Q.T @ J[3:] @ data.qvel
+                P = (rom.M_hand + small.rigid)[:3] @ np.concatenate([V, spin])
+                P = P + small.small.G[:, :3].T @ tissue.e + np.cross(spin, small.small.G[:, :3].T @ tissue.a)
+                kept.append(Q @ P)
+        drift.append(np.ptp(kept, axis=0).max() / np.linalg.norm(kept[0]))
+        assert rigid or np.abs(tissue.a).max() > 0
+    assert drift[1] < 1.3 * drift[0]  # the paths differ a little; measured 1.07
+    assert drift[1] < 5e-4
+
+
+@pytest.mark.parametrize(("solver", "digits"), [("Newton", 1e-8), ("CG", 1e-4)])
+def test_a_hand_set_down_presses_with_its_weight_and_that_of_its_tissue(
+    rom: TurningModel, solver: str, digits: float
+) -> None:
+    box = '<freejoint/><geom type="box" size=".08 .08 .05" mass="0"/>'
+    body = mujoco_body(rom, joint=box).replace('<body name="hand">', '<body name="hand" pos="0 0 .052">')
+    model = world(body + '<geom type="plane" size="2 2 .1"/>', 1e-3, "0 0 -9.81", f'solver="{solver}"')
+    data, tissue = mujoco.MjData(model), MujocoTissue(rom, model)
+    tissue.settle(data)
+    for _ in range(2000):
+        tissue.step(data)
+    force, local = np.zeros(3), np.zeros(6)
+    for c in range(data.ncon):
+        mujoco.mj_contactForce(model, data, c, local)
+        force += data.contact[c].frame.reshape(3, 3).T @ local[:3]
+    weight = 9.81 * (rom.M_hand[0, 0] + rom.at(1e-3).rigid[0, 0])
+    assert force[2] == pytest.approx(weight, rel=digits)  # what the solver of contact leaves
+    sag = np.linalg.solve(tissue.small.K, tissue.small.G[:, :3] @ [0.0, 0.0, -9.81])
+    assert tissue.a == pytest.approx(sag, abs=1e-4 * np.abs(sag).max())
+    assert tissue.outputs["tip_z"] == pytest.approx(
+        float(rom.outputs.C_z[rom.outputs.names.index("tip_z")] @ sag), rel=1e-3
+    )
+    assert tissue.wrench == pytest.approx(np.zeros(6), abs=1e-2 * weight * 0.1)  # at rest there is the weight alone
+
+
+def test_the_file_is_a_model_with_the_mass_of_both(rom: TurningModel, tmp_path: Path) -> None:
+    path = write_mujoco(rom, tmp_path / "folder" / "hand.xml", 2e-3)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data, rigid = mujoco.MjData(model), rom.at(1.0).rigid
+    mujoco.mj_forward(model, data)
+    full = np.zeros((6, 6))
+    try:
+        mujoco.mj_fullM(model, data, full)
+    except TypeError:  # the order of the arguments before version 4
+        mujoco.mj_fullM(model, full, data.qM)
+    assert full == pytest.approx(rom.M_hand + rigid, abs=1e-9)  # a free joint at rest has the axes of the body
+    MujocoTissue(rom, model, dt=2e-3).step(data)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResourceError, match="cannot be written"):
+        write_mujoco(rom, tmp_path / "file" / "hand.xml")
+
+
+def test_what_does_not_fit_is_refused(rom: TurningModel) -> None:
+    body = mujoco_body(rom)
+    for keys, text in (
+        ({"option": 'solver="PGS"'}, "dual solvers"),
+        ({"option": 'noslip_iterations="3"'}, "dual solvers"),
+        ({"option": 'integrator="RK4"'}, "another method than Euler"),
+        ({"option": 'integrator="implicitfast"'}, "another method than Euler"),
+    ):
+        with pytest.raises(ModelError, match=text):
+            MujocoTissue(rom, world(body, 1e-3, **keys))
+    model = world(body, 1e-3)
+    with pytest.raises(ModelError, match=r"step of the MuJoCo model is 0\.001 s and dt = 0\.002 s"):
+        MujocoTissue(rom, model, dt=2e-3)
+    with pytest.raises(ModelError, match="has no body 'finger'; it has hand, hand_tissue"):
+        MujocoTissue(rom, model, body="finger")
+    with pytest.raises(ModelError, match="and its tissue"):
+        MujocoTissue(rom, world('<body name="hand"><freejoint/><geom size=".01" mass=".001"/></body>', 1e-3))
+    with pytest.raises(ModelError, match="small angles"):
+        MujocoTissue(reduced({"damping": False}, 12, turns=False), model)
