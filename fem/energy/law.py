@@ -118,9 +118,14 @@ class EnergyLaw(Law):
         return bool(np.isfinite(self.energy(H, *moduli)).all())
 
     def stiffness(self, *moduli: Array) -> Array:
-        """See :class:`softgrasp.fem.strain.laws.Law`: the largest entry of the tangent at rest."""
-        shape = np.shape(moduli[0]) if moduli else ()
+        """See :class:`softgrasp.fem.strain.laws.Law`: the largest entry of the tangent at rest without its lambda.
+
+        The pressure of a nearly incompressible law is small though lambda is large.
+        """
+        shape, d = np.shape(moduli[0]) if moduli else (), self.d
         A = self.at_rest(dict(zip(self.inputs, moduli, strict=True)))
+        apart = np.min([A[i, i, j, j] for i in range(d) for j in range(d) if i != j], axis=0)
+        A -= np.einsum("ij,km,...->ijkm...", np.eye(d), np.eye(d), np.maximum(apart, 0.0))
         return np.asarray(np.broadcast_to(np.abs(A).max(axis=(0, 1, 2, 3)), shape))
 
     def kernel(self, points: QuadraturePoints, moduli: tuple[Array, ...]) -> EnergyKernel | None:
