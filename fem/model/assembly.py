@@ -18,7 +18,14 @@ from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import BlockLayout, bounding_box
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
-from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
+from softgrasp.fem.model.contact import (
+    cells_in,
+    contact_blocks,
+    contact_centre,
+    contact_facets,
+    held_check,
+    rigid_modes,
+)
 from softgrasp.fem.model.patches import make_patches
 from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.scene.scene import FiniteStrain, Scene
@@ -94,8 +101,7 @@ def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
     if scene.hand.reference is not None:
         reference = np.asarray(scene.hand.reference, dtype=float)
     else:
-        sums = total(comm, np.append(X[contact, :d].sum(axis=0), float(len(contact))))
-        reference = sums[:d] / sums[d]
+        reference = contact_centre(mesh, facets)
     modes = rigid_modes(X, d, scene.effects.rotation, reference)
     R = np.zeros(modes.shape, order="F")
     rows = (contact[:, None] * d + np.arange(d)).ravel()

@@ -13,7 +13,7 @@ from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.check import Flags, Floats, Ints, Parts, place_text
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
-from softgrasp.fem.petsc import on_root
+from softgrasp.fem.petsc import on_root, total
 from softgrasp.fem.scene.scene import Contact
 from softgrasp.fem.shown import counted
 
@@ -168,6 +168,20 @@ def contact_blocks(space: dolfinx.fem.FunctionSpace, facets: Ints) -> tuple[Ints
     on = np.zeros(owned, dtype=np.bool_)
     on[located[located < owned]] = True
     return np.flatnonzero(on).astype(np.int32), np.flatnonzero(~on).astype(np.int32)
+
+
+def contact_centre(tissue: TissueMesh, facets: Ints) -> Floats:
+    """Centroid of the contact zone, (d,) [m]: by area, so that no other mesh of the zone has another. Collective.
+
+    ``facets``: owned facets of the zone.
+    """
+    mesh, d = tissue.mesh, tissue.dimension
+    mesh.topology.create_connectivity(d - 1, d)
+    x = mesh.geometry.x[dolfinx.mesh.entities_to_geometry(mesh, d - 1, facets), :d]
+    edges = x[:, 1:] - x[:, :1]
+    area = np.sqrt(np.linalg.det(edges @ edges.transpose(0, 2, 1)))  # times (d - 1)!
+    sums = total(mesh.comm, np.append(area @ x.mean(axis=1), area.sum()))
+    return np.asarray(sums[:d] / sums[d])
 
 
 def rigid_modes(points: Floats, dimension: int, rotation: bool, reference: npt.ArrayLike) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Literal, overload
 
 from softgrasp.fem.adjoint.result import Loss, RunGradient
 from softgrasp.fem.material import LayerMaterial
@@ -26,7 +26,7 @@ def gradient(
     force: Array | None = None,
     hand: tuple[Array, Array] | None = None,
     materials: tuple[LayerMaterial, ...] | None = None,
-    x0: Array | None = None,
+    x0: Array | Literal["equilibrium"] | None = None,
 ) -> RunGradient[ReducedTrajectory]: ...
 
 
@@ -50,7 +50,7 @@ def gradient(
     force: Array | None = None,
     hand: tuple[Array, Array] | None = None,
     materials: tuple[LayerMaterial, ...] | None = None,
-    x0: Array | None = None,
+    x0: Array | Literal["equilibrium"] | None = None,
     segment: int | None = None,
 ) -> RunGradient[ReducedTrajectory] | RunGradient[Trajectory]:
     """J(y) of a run and all its derivatives by the adjoint, the midpoint rule backwards [HLW06].
@@ -79,7 +79,8 @@ def gradient(
             one takes the drive of its scene without both.
         hand: q_s and v_s of a prescribed hand, (steps + 1, n_s) each, instead of a force.
         materials: one a layer; None: those of the model.
-        x0: initial state (N,) of a reduced run; None is zero. A full run starts as its scene says.
+        x0: initial state (N,) of a reduced run, or "equilibrium", that under gravity, which moves with the materials;
+            None is zero. A full run starts as its scene says.
         segment: steps of a full run whose states are kept at once; None: all where half of the free memory holds them,
             else about sqrt(steps), and the run is made once more in segments [GW00].
 

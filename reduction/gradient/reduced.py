@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -33,7 +34,7 @@ def reduced_gradient(
     force: Array | None = None,
     hand: tuple[Array, Array] | None = None,
     materials: tuple[LayerMaterial, ...] | None = None,
-    x0: Array | None = None,
+    x0: Array | Literal["equilibrium"] | None = None,
 ) -> RunGradient[ReducedTrajectory]:
     """J and its derivatives, dJ/dtheta = sum_n h l_n' (A_theta x_{n+1/2} + f_theta) - l_n' E_theta (x_{n+1} - x_n).
 
@@ -46,15 +47,19 @@ def reduced_gradient(
         force: u on the hand at the step midpoints, (steps, n_s) [N, N m].
         hand: q_s and v_s of a prescribed hand, (steps + 1, n_s) each, instead of a force.
         materials: one a layer; None: those of the projection.
-        x0: initial state (N,); None is zero.
+        x0: initial state (N,), which does not depend on the materials; "equilibrium": that under gravity, A x_0 + f = 0
+            in the rows of the tissue, whose change with them the derivatives contain; None is zero.
 
     Raises:
-        ModelError: neither or both of force and hand are given, or shapes do not fit.
+        ModelError: there is no such equilibrium, neither or both of force and hand are given, or shapes do not fit.
         UnstableModelError: the model has growing modes there.
     """
     materials = rom.materials if materials is None else materials
     system = rom.at(materials)
-    answer = run(system, dt, force, hand, x0)
+    settled = isinstance(x0, str)
+    if isinstance(x0, str) and x0 != "equilibrium":
+        raise ModelError(f"x0 = '{x0}': the initial state must be an array of N numbers, or 'equilibrium'")
+    answer = run(system, dt, force, hand, system.equilibrium() if isinstance(x0, str) else x0)
     value, r = loss(answer.outputs)
     r = np.asarray(r, dtype=float)
     if r.shape != answer.outputs.shape:
@@ -67,6 +72,11 @@ def reduced_gradient(
         -costate.T @ np.diff(x, axis=0),
         dt * costate.sum(axis=0),
     )
+    start, hands = _start(system, rows, r, costate, dt), 2 * system.n_s
+    if settled:  # dx_0 = -A^-1 (dA x_0 + df) in the rows of the tissue
+        zeta = np.linalg.solve(system.A[hands:, hands:].T, start[hands:])
+        slope_a[hands - rows.start :] -= np.outer(zeta, x[0])
+        slope_f[hands - rows.start :] -= zeta
 
     def along(other: EnergySystem) -> float:
         """sum_ij dJ/dA_ij (A_ij of another system less ours), and so on."""
@@ -93,7 +103,7 @@ def reduced_gradient(
         beta=of("beta") if rom.damped else None,
         rho=of("rho") if rom.coordinates == "qv" else None,
         alpha=along(replace(rom, alpha=rom.alpha + 1.0).at(materials)) if rom.damped else None,
-        start=_start(system, rows, r, costate, dt),
+        start=start,
         force=dt * costate @ system.B if hand is None else None,
         hand=None if hand is None else _hand(system, rows, r, costate, dt),
     )

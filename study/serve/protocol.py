@@ -22,6 +22,7 @@ SUPPORT = {
     "bound": {"Evaluate": True, "Gradient": False, "ApplyJacobian": False, "ApplyHessian": False},
 }
 NEEDED = {"/Evaluate": "Evaluate", "/Gradient": "Gradient", "/ApplyJacobian": "ApplyJacobian"}
+POSTED = ("/InputSizes", "/OutputSizes", "/ModelInfo", "/ApplyHessian", *NEEDED)
 CONFIG = ("tolerance", "allow")
 
 
@@ -31,6 +32,11 @@ class RequestError(Exception):
     def __init__(self, kind: str, text: str, status: int = 400) -> None:
         super().__init__(text)
         self.kind, self.status = kind, status
+
+
+def allowed(path: str) -> tuple[str, ...]:
+    """Methods of HTTP that a path takes; all that the server knows where there is no such path."""
+    return ("POST",) if path in POSTED else ("GET", "POST")
 
 
 @dataclass
@@ -62,9 +68,12 @@ class Served:
             return 400, {"error": {"type": "InvalidInput", "message": str(error)}}
 
     def _answer(self, method: str, path: str, body: Any) -> dict[str, Any]:
+        if method not in (methods := allowed(path)):
+            words = " or ".join(methods)
+            raise RequestError("UnsupportedFeature", f"{method} {shortened(path)}: the method must be {words}", 405)
         if path == "/Info":
             return {"protocolVersion": 1.0, "models": list(MODELS)}
-        if method != "POST" or path not in ("/InputSizes", "/OutputSizes", "/ModelInfo", "/ApplyHessian", *NEEDED):
+        if path not in POSTED:
             raise RequestError("UnsupportedFeature", f"{method} {shortened(path)} is not part of the protocol", 404)
         name = body.get("name") if isinstance(body, dict) else None
         if name not in MODELS:

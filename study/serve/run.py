@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import json
 import socket
+from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
@@ -15,9 +16,10 @@ from rich.console import Console
 from softgrasp.fem import SceneError
 from softgrasp.fem.errors import shortened
 from softgrasp.reduction import load_certified
-from softgrasp.study.serve.protocol import KEYS, MODELS, Served
+from softgrasp.study.serve.protocol import KEYS, MODELS, Served, allowed
 
 LARGEST = 50_000_000  # byte of a request
+OTHERS = ("HEAD", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT")  # methods of HTTP beside GET and POST
 PATIENCE = 30.0  # time that a client may take for its request [s]
 
 
@@ -55,6 +57,14 @@ def make_server(served: Served, host: str, port: int) -> HTTPServer:
                 return
             self._reply(*served.answer("POST", self.path, body))
 
+        def _other(self) -> None:
+            self._reply(*served.answer(self.command, self.path, {}))
+
+        def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+            """What is no HTTP, or a method that HTTP does not have, as the protocol answers."""
+            text = message or explain or str(code)
+            self._reply(code, {"error": {"type": "InvalidInput", "message": text}})
+
         def _refuse(self, text: str) -> None:
             self._reply(400, {"error": {"type": "InvalidInput", "message": text}})
 
@@ -63,11 +73,19 @@ def make_server(served: Served, host: str, port: int) -> HTTPServer:
             self.send_response(status)
             self.send_header("Content-Type", "application/json")
             self.send_header("Content-Length", str(len(data)))
+            if status == HTTPStatus.METHOD_NOT_ALLOWED:
+                self.send_header("Allow", ", ".join(allowed(self.path)))
+            if status != HTTPStatus.OK:  # the rest of the request was not read
+                self.send_header("Connection", "close")
             self.end_headers()
-            self.wfile.write(data)
+            if self.command != "HEAD":
+                self.wfile.write(data)
 
         def log_message(self, *_: object) -> None:
             """No line for each request."""
+
+    for method in OTHERS:
+        setattr(Handler, f"do_{method}", Handler._other)
 
     class Server(HTTPServer):
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET

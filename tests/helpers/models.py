@@ -179,6 +179,7 @@ class Reference:
     M_layers: list[Array]
     K_layers: list[Array]
     betas: list[float]
+    centre: Array  # of the zone
 
     @property
     def d(self) -> int:
@@ -195,10 +196,6 @@ class Reference:
     @property
     def K(self) -> Array:
         return sum(self.K_layers)
-
-    @property
-    def centre(self) -> Array:
-        return self.nodes[self.contact].mean(axis=0)
 
     @property
     def R(self) -> Array:
@@ -265,8 +262,11 @@ def reference(model: Model, held: Held = held_by_paper) -> Reference:
         K_layers.append(tissue.thickness * K.toarray()[np.ix_(order, order)])
         M_layers.append(tissue.thickness * m.rho * _mass.assemble(basis).toarray()[np.ix_(order, order)])
     on = np.zeros(basis.N, dtype=bool)
-    on[basis.get_dofs(mesh.facets_satisfying(held, boundaries_only=True)).flatten()] = True
-    return Reference(scene, where.T[order][::d].copy(), on[order][::d].copy(), M_layers, K_layers, betas)
+    zone = mesh.facets_satisfying(held, boundaries_only=True)
+    on[basis.get_dofs(zone).flatten()] = True
+    surface = skfem.FacetBasis(mesh, scalar, facets=zone)
+    centre = (np.asarray(surface.default_parameters()["x"]) * surface.dx).sum(axis=(1, 2)) / surface.dx.sum()
+    return Reference(scene, where.T[order][::d].copy(), on[order][::d].copy(), M_layers, K_layers, betas, centre)
 
 
 # --- the paper's first-order system E x' = A x + b(u), x = [q_s, q_e, v_s, v_e], in absolute displacements

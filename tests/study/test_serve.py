@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import threading
 import urllib.error
@@ -156,8 +157,31 @@ def test_refusals_are_one_sentence(url: str, path: str, body: Any, kind: str, se
 def test_what_is_no_request_is_refused_and_the_server_goes_on(url: str) -> None:
     assert ask(url, "/Evaluate", raw=b"{")[1]["error"]["message"] == "the request is no JSON"
     assert ask(url, "/Evaluate", raw=b"NaN")[0] == 400
-    assert ask(url, "/Evaluate")[0] == 404
     assert ask(url, "/ModelInfo", {"name": "bound"})[1]["support"]["Evaluate"]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status", "allow"),
+    [
+        ("GET", "/Evaluate", 405, "POST"),
+        ("PUT", "/Evaluate", 405, "POST"),
+        ("DELETE", "/Info", 405, "GET, POST"),
+        ("HEAD", "/Info", 405, "GET, POST"),
+        ("OPTIONS", "/ModelInfo", 405, "POST"),
+        ("GET", "/", 404, None),
+        ("BREW", "/Info", 501, None),
+    ],
+)
+def test_other_methods_get_their_status_and_what_is_allowed(
+    url: str, method: str, path: str, status: int, allow: str | None
+) -> None:
+    connection = http.client.HTTPConnection(url.removeprefix("http://"), timeout=60)
+    connection.request(method, path)
+    answer = connection.getresponse()
+    text = answer.read()
+    connection.close()
+    assert (answer.status, answer.headers["Allow"]) == (status, allow)
+    assert not text if method == "HEAD" else json.loads(text)["error"]["message"]
 
 
 def test_files_names_and_addresses_that_do_not_fit(url: str, tmp_path: Path) -> None:

@@ -97,6 +97,15 @@ def test_blocks_equal_scikit_fem(comm: MPI.Intracomm, name: str) -> None:
 
 
 @pytest.mark.ranks
+@pytest.mark.parametrize(("cells", "order"), [([4, 3, 6], 2), ([4, 3, 6], 3), ([5, 4, 5], 1)])
+def test_the_hand_turns_about_one_point_on_every_mesh(comm: MPI.Intracomm, cells: list[int], order: int) -> None:
+    """Three cells across crowd at one side: the mean of the nodes is 6 mm beside the centre of the zone."""
+    keys = [f"tissue.cells={cells}", f"tissue.order={order}"]
+    layout = build(load_scene(shipped_scenes()["block_3d"], keys), comm=comm).system.layout
+    np.testing.assert_allclose(layout.reference, [0.025, 0.025, 0.0875], atol=1e-15)  # rounding of sums of about 0.1
+
+
+@pytest.mark.ranks
 @pytest.mark.parametrize("name", [n for n in SCENES if "layers" in n])
 def test_layered_viscosity_equals_scikit_fem(comm: MPI.Intracomm, name: str) -> None:
     model = build(make_scene(*SCENES[name][0]), comm=comm)

@@ -35,7 +35,11 @@ def plain(rom: Any, materials: Any, alpha: Any, dt: float, force: Any, hand: Any
     left, right = s.E - dt / 2 * s.A, s.E + dt / 2 * s.A
     steps = len(force) if hand is None else len(hand[0]) - 1
     x = np.zeros((steps + 1, s.N), dtype=complex)
-    x[0] = x0
+    if isinstance(x0, str):
+        j = 2 * s.n_s
+        x[0, j:] = -np.linalg.solve(s.A[j:, j:], s.f[j:])
+    else:
+        x[0] = x0
     if hand is not None:
         q, v = hand
         at = np.concatenate([q[:1], q[0] + dt * np.cumsum((v[1:] + v[:-1]) / 2, axis=0)])
@@ -100,6 +104,32 @@ def test_gradients_are_those_of_complex_steps(case: tuple[Any, dict[str, Any]]) 
                 "hand": tuple(bump if j == part else t.astype(complex) for j, t in enumerate(tables))
             }  # fmt: skip
             assert abs(slopes[part][n, 1] - slope(**changed)) <= EXACT * np.abs(slopes[part]).max(), (part, n)
+
+
+@pytest.mark.parametrize("drive", ["motion", "force"])
+def test_a_start_in_equilibrium_moves_with_the_material(drive: str) -> None:
+    keys = [
+        "tissue.cells=[4, 8]",
+        "effects.gravity={g=[1.0, -9.0]}",
+        f"motion.drive='{drive}'",
+        "time.start='equilibrium'",
+    ]
+    model = sg.build("paper_forward", [*KEYS, *keys, f"effects.reaction={str(drive == 'force').lower()}"])
+    run = sg.simulate(model)
+    rom = sg.reduce(model, run, "craig_bampton", N=14)
+    given: dict[str, Any] = {"dt": run.times[1], "force": None, "hand": None, "x0": "equilibrium"}
+    given |= {"hand": (run.q_s, run.v_s)} if drive == "motion" else {"force": run.force}
+    found = sg.gradient(rom, lambda y: ((y**2).sum() / 2, y), **given)
+    still = sg.gradient(rom, lambda y: ((y**2).sum() / 2, y), **given | {"x0": rom.at().equilibrium()})
+    assert found.value == still.value
+    for key in ("lam", "mu", "rho", "beta"):
+        m = replace(rom.materials[0], **{key: getattr(rom.materials[0], key) + 1j * TINY})
+        exact = plain(rom, (m,), rom.alpha, y=0.0, **given).imag / TINY
+        assert getattr(found, key)[0] == pytest.approx(exact, rel=1e-11), key  # rounding of 60 steps
+    assert abs(found.mu / still.mu - 1) > 1e-3  # a start that stays has another one
+    np.testing.assert_array_equal(found.beta, still.beta)
+    with pytest.raises(ModelError, match="x0 = 'rest': the initial state must be an array"):
+        sg.gradient(rom, lambda y: (0.0, y), **given | {"x0": "rest"})
 
 
 def test_what_does_not_fit_is_refused(case: tuple[Any, dict[str, Any]]) -> None:
