@@ -107,8 +107,11 @@ def refused(answer: Identified, part: Array, why: str) -> Identified:
     return replace(answer, reasons=(*answer.reasons, reason))
 
 
-def chosen(linear: Identified, strained: Identified, part: Array) -> Identified:
-    """The answer at finite strain, unless the data speak for linear elasticity; says which and why."""
+def chosen(linear: Identified, strained: Identified, part: Array, failed: str = "") -> Identified:
+    """The answer at finite strain, unless the data speak for linear elasticity; says which and why.
+
+    ``failed``: why it has no reduced model at finite strain, but full runs and slopes of linear elasticity.
+    """
     misfits = f"{strained.residuals.misfit:.3g} sigma against {linear.residuals.misfit:.3g}"
     if _squares(strained) - _squares(linear) > CHANCE**2:
         sentence = (
@@ -121,6 +124,10 @@ def chosen(linear: Identified, strained: Identified, part: Array) -> Identified:
         f"{_beyond(linear, part, i)}: the values are those of finite strain with the law {strained.law} (misfit "
         f"{misfits}); another law has others."
     )
+    if failed:
+        sentence += (
+            f" They come from full runs and slopes of linear elasticity, for no reduced model runs there: {failed}"
+        )
     runs = linear.runs + strained.runs
     history = (*linear.history, *strained.history[1:])
     return replace(strained, warnings=(sentence, *strained.warnings), runs=runs, history=history)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
@@ -207,11 +208,15 @@ def _solve(
     nuisances: Nuisances,
     start: Array,
     asked: Asked,
+    linear: Model | None = None,
 ) -> Solved:
-    """Fit with small models, which full runs correct while the reduction exceeds the noise. Collective."""
+    """Fit with small models, which full runs correct while the reduction exceeds the noise. Collective.
+
+    ``linear``: the model without finite strain, whose small models with full runs of ``model`` serve.
+    """
     k, strain, again = len(unknowns), model.scene.effects.finite_strain, 0
     while True:
-        make = _small_models(model, unknowns, experiments, asked, exact=again > 0)
+        make = _small_models(model, unknowns, experiments, asked, exact=again > 0, linear=linear)
         found = fit_rounds(make, experiments, start, asked.sigma, nuisances, robust=asked.robust, progress=asked.tick)
         line, theta = linearise(found.misfit, found.p, asked.robust), np.exp(found.p[:k])
         errors = errors_of_outputs(found.misfit.near, theta, found.misfit.answers(found.p)[1], experiments)
@@ -223,20 +228,27 @@ def _solve(
 
 
 def _small_models(
-    model: Model, unknowns: Sequence[Unknown], experiments: Sequence[Experiment], asked: Asked, exact: bool
+    model: Model,
+    unknowns: Sequence[Unknown],
+    experiments: Sequence[Experiment],
+    asked: Asked,
+    exact: bool,
+    linear: Model | None = None,
 ) -> Callable[[Array], Local]:
     """What makes a small model near values. Raises SceneError: there is none. Collective.
 
     ``exact``: correct a linear one by full runs at the values.
     """
     if model.system.points is not None:
-        from softgrasp.reduction.identify.strained import Strained, check_strained
+        from softgrasp.reduction.identify.strained import Corrected, Strained, check_strained
 
         if asked.certified is not None:
             raise SceneError(
                 "--certified: its bound is of linear elasticity; leave out effects.finite_strain and --law"
             )
         check_strained(model, unknowns, experiments)
+        if linear is not None:
+            return lambda values: Corrected(model, linear, unknowns, values, asked.N, experiments)
         return lambda values: Strained(model, unknowns, values, asked.N, experiments)
     if asked.certified is not None:
         from softgrasp.reduction.identify.boxed import Boxed, load_for
@@ -269,11 +281,18 @@ def _within_range(answer: Identified, solved: Solved, first: Array, asked: Asked
         return known
     model = strained_model(fit.misfit.near.model, beyond.DEFAULT)
     experiments = [replace(e, scene=moved_as(model.scene, e)) for e in fit.misfit.experiments]
+    solve = partial(_solve, model, unknowns, experiments, fit.misfit.nuisances, fit.p, replace(asked, certified=None))
+    more = ""
     try:
-        other = _solve(model, unknowns, experiments, fit.misfit.nuisances, fit.p, replace(asked, certified=None))
+        try:
+            other = solve()
+        except SolverError as error:  # no reduced model at finite strain has a run; full ones may
+            more, other = str(error), solve(linear=fit.misfit.near.model)
+            if other.fit.unsettled:  # its misfit says nothing about the law
+                raise
     except (SceneError, SolverError) as error:
         return beyond.refused(known, part, str(error))
-    return beyond.chosen(answer, _answer(other, first, asked), part)
+    return beyond.chosen(answer, _answer(other, first, asked), part, more)
 
 
 def _answer(solved: Solved, start: Array, asked: Asked) -> Identified:

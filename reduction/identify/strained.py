@@ -2,12 +2,16 @@
 
 The full run at the values is one of those that train the model, so that this costs nothing; what it leaves of the error
 of the reduction grows with the distance from them, and falls as the rounds settle.
+
+Where no such model has a run, as on tiny cells beside the ends of the hand, the linear one takes its place with
+what it lacks of one full run at finite strain: exact at the values of the round, with slopes of linear elasticity.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +22,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.strain.laws import LawName
 from softgrasp.reduction.bases.states import BasisError
-from softgrasp.reduction.identify.near import RADIUS, Experiment, Local, motions
+from softgrasp.reduction.identify.near import RADIUS, Experiment, Local, Near, motions
 from softgrasp.reduction.identify.unknowns import Unknown, assumed, materials_at, value_of
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.parameters import thinned
@@ -147,6 +151,56 @@ class Strained(Local):
         """Parameters that are not fitted; of the densities only their common factor."""
         every = tuple(range(len(self.model.system.materials)))
         return (*(u for u in assumed(self.model, self.unknowns) if u.kind != "rho"), Unknown("rho", "rho", every))
+
+
+class Corrected(Local):
+    """The linear small model with what it lacks of the full run at finite strain at some values.
+
+    y(theta) = y_N(theta) + [y_h - y_N](theta_0); rounds settle where J' (y_h - data) = 0 with the J of linear
+    elasticity, which lies within the noise of the best values where the law holds.
+
+    Args:
+        model: at finite strain.
+        linear: the same without.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        linear: Model,
+        unknowns: Sequence[Unknown],
+        values: Array,
+        N: int,
+        experiments: Sequence[Experiment],
+    ) -> None:
+        super().__init__(model, unknowns)
+        self.near = Near(linear, unknowns, values, N, experiments)
+        full = self.full(values)
+        runs = {i: simulate(replace(full, scene=e.scene)).outputs for i, e in motions(experiments).items()}
+        self.make_exact(values, experiments, runs)
+
+    @property
+    def size(self) -> int:
+        """Dimension of the small model, the hand's 2 n_s included."""
+        return self.near.size
+
+    def limits(self, theta: Array) -> tuple[Array, Array]:
+        """What a round may move: less than the linear model alone may, for what it lacks changes too."""
+        return theta - REACH[0], theta + REACH[0]
+
+    def system(self, values: Array) -> Any:
+        """Linear reduced system at values. Raises ModelError: they are no material."""
+        return self.near.system(values)
+
+    def small_run(self, small: Any, experiment: Experiment, refined: int = 1) -> ReducedTrajectory:
+        """Linear reduced run."""
+        return self.near.small_run(small, experiment, refined)
+
+    def slopes(
+        self, values: Array, by: Sequence[Unknown], small: Any, answer: ReducedTrajectory, experiment: Experiment
+    ) -> Array:
+        """dy/dlog of some parameters by linear elasticity, (parameters, steps + 1, p)."""
+        return self.near.slopes(values, by, small, answer, experiment)
 
 
 def _changed(materials: Materials, u: Unknown, factor: float) -> Materials:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,12 @@ import pytest
 
 import softgrasp as sg
 from softgrasp.fem.errors import SceneError, SolverError
+from softgrasp.fem.model.scales import gradient
+from softgrasp.reduction.identify.beyond import linear_range
 from softgrasp.reduction.identify.data import Measurements
+from softgrasp.reduction.identify.fit import Misfit, Nuisances
+from softgrasp.reduction.identify.near import Near, experiment
+from softgrasp.reduction.identify.unknowns import parse_unknowns
 
 pytestmark = pytest.mark.serial
 TRUTH = {"mu": 70.0, "beta": 0.025}
@@ -74,6 +80,7 @@ def test_a_linear_fit_of_neo_hookean_data_does_not_pass_in_silence(noise: float)
     assert any("Linear elasticity has an error of about" in text for text in found.warnings)  # the strain always does
 
 
+@pytest.mark.slow  # the quick one is below, without a reduced model
 def test_linear_data_keep_linear_values_whatever_the_strain() -> None:
     found = sg.identify(model(), data(1e-2, ""), "mu,beta", 1e-2)
     assert found.law == "linear"
@@ -101,14 +108,47 @@ def test_small_strain_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (found.law, found.warnings, set(found.parts)) == ("linear", (), {"mesh", "time step", "reduction"})
 
 
-def test_a_fit_at_finite_strain_that_fails_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: Any) -> None:
-        raise SolverError("the body folds")
+def fails(*_: Any) -> None:
+    raise SolverError("the body folds")
 
+
+def test_without_a_reduced_model_full_runs_and_linear_slopes_decide(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("softgrasp.reduction.identify.strained.Strained._around", fails)
+    found = sg.identify(model(), data(1e-2), "mu,beta", 1e-2)
+    assert (found.law, found.reasons) == ("neo-hooke", ())
+    assert found.warnings[0].endswith("for no reduced model runs there: the body folds")
+    # other slopes weigh the noise in another way, by less than it is
+    assert (np.abs(np.log(found.values / automatic().values)) < found.noise).all()
+    assert (np.abs(errors(found)) < 2 * found.total).all()
+    # rounds settle where a value moves by 5 %, and the small model is exact to second order in that
+    assert (np.abs(found.parts["reduction"]) < found.noise).all()
+    linear = sg.identify(model(), data(1e-2, ""), "mu,beta", 1e-2)
+    assert (linear.law, linear.reasons) == ("linear", ())
+    assert linear.warnings[-1].startswith("Finite strain (neo-hooke) matters at these strains, and fits worse")
+
+
+def test_a_fit_at_finite_strain_that_fails_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("Strained._around", "Corrected.__init__"):
+        monkeypatch.setattr(f"softgrasp.reduction.identify.strained.{name}", fails)
     found = sg.identify(model(), data(1e-2), "mu,beta", 1e-2)
     assert found.law == "linear"
     assert found.reasons[-1].endswith("and the fit at finite strain fails: the body folds")
+
+
+def test_the_range_of_linear_elasticity_does_not_depend_on_the_mesh() -> None:
+    """The mean of |grad z|^2 converges beside the singular ends of the hand, where the largest does not."""
+    found, largest = [], []
+    for tolerance in (3e-2, 1e-2, 3e-3):
+        at = sg.build("paper_forward", [*FIT, f"tissue.refine.tolerance={tolerance}"])
+        experiments = [experiment(at, data(1e-2), Path())]
+        near = Near(at, parse_unknowns(["mu"], at), np.array([50.0]), 36, experiments)
+        misfit = Misfit(near, experiments, np.array([1e-2, 1e-2]), Nuisances((), ()))
+        found.append(linear_range(misfit, np.log([50.0])).error)
+        Z = near.displacements(np.array([50.0]), misfit.answers(np.log([50.0]))[1][0], 20)
+        assert Z is not None
+        largest.append(gradient(at, Z[:, -1]).largest)
+    assert max(found) / min(found) < 1.03  # the meshes differ by their errors, 3 % and less
+    assert largest[-1] / largest[0] > 1.3
 
 
 def test_a_scene_at_finite_strain_is_fitted_with_its_law_gravity_and_two_motions() -> None:
@@ -117,7 +157,7 @@ def test_a_scene_at_finite_strain_is_fitted_with_its_law_gravity_and_two_motions
         "time.start='equilibrium'",
         "effects.finite_strain={law='neo-hooke-quadratic'}",
     ]
-    coarse = [*SQUARE, "tissue.cells=[4,4]", "time.steps=100", "effects.damping={kind='kelvin-voigt',beta=0.02}", *keys]
+    coarse = [*SQUARE, "tissue.cells=[4,4]", "time.steps=60", "effects.damping={kind='kelvin-voigt',beta=0.02}", *keys]
     true = sg.build("paper_forward", [*coarse, "tissue.material.mu=58"])
     run = sg.simulate(true)
     other = sg.simulate(sg.build("paper_forward", [*coarse, "tissue.material.mu=58", "motion.target=[-1.0,2.0]"]))
