@@ -264,7 +264,7 @@ def layer_numbers(mesh: TissueMesh, scene: Scene) -> tuple[tuple[str, ...], np.n
     counts = total(mesh.mesh.comm, np.bincount(numbers, minlength=len(names)).astype(np.float64))
     if not counts[:-1].all():
         empty = names[int(np.argmin(counts[:-1] > 0))]
-        raise SceneError(f"tissue.layers.{empty} has no cell of {mesh.source}; check its tag or box")
+        raise SceneError(f"tissue.layers.{empty} has no cell of the mesh; check its tag or box")
     return names if counts[-1] else names[:-1], numbers
 
 
