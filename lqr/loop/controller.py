@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, field, replace
+from math import hypot
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,9 @@ if TYPE_CHECKING:
     from softgrasp.lqr.loop.filter import Filter
     from softgrasp.lqr.program.program import Program
 
+ABSURD = 1e150  # of a sample of the hand: squares of what follows from it are no numbers
 FORMAT = 1
+PLANNED = 2  # format of a controller with a plan, which a reader without plans must not take for its gain alone
 PLANT = ("E", "A", "B", "C", "f", "S_q", "S_v")  # arrays of the reduced plant in a file
 FILTER = ("A", "B", "f", "C", "M")  # of the observer
 
@@ -158,14 +161,18 @@ class Controller(Shown):
         """Load after one tick of the tissue [N, N m], (n_s,), from the measured hand q_s [m, rad] and v_s, (n_s,).
 
         ``y``: samples of the observer beside those of the hand [m, N], in the order of its names; an entry that is no
-        number, or None for all, is lost.
+        number, or None for all, is lost. Where the hand is not measured, or its samples are absurdly large, a
+        controller without observer gives the load of the tick before again; a plan goes on.
 
-        Raises ControlError: there is no observer for y, or y has another number of entries.
+        Raises ControlError: there is no observer for y, y has another number of entries, or the hand is not measured at
+        the first tick.
         """
         if self.observer is not None:
             return self._observed(q_s, v_s, y)
         if y is not None:
             raise ControlError("this controller has no observer that takes y; leave it out, or give the scene one")
+        if not hypot(*q_s, *v_s) < ABSURD:
+            return self._again()
         n_s, x = self.n_s, self._x
         step, accelerated, dragged, constant = self.model
         if not self._fresh:
@@ -177,7 +184,16 @@ class Controller(Shown):
             x[2 * n_s :] = tissue + constant
         self._fresh = False
         x[:n_s], x[n_s : 2 * n_s] = q_s, v_s
-        return self._load(x)
+        self._last = self._load(x)
+        return self._last.copy()
+
+    def _again(self) -> Array:
+        """The load of the tick before, where the hand is not measured."""
+        if self._fresh:
+            raise ControlError("the first samples of the hand must be finite; begin when q_s and v_s are measured")
+        if self.planner is not None:
+            self.replanner.command(np.full(len(self._x), np.nan))
+        return self._last.copy()
 
     def _load(self, x: Array) -> Array:
         """Load of a tick for the state x, of the plan where there is one."""
@@ -221,7 +237,7 @@ class Controller(Shown):
         Raises ControlError: the file cannot be written.
         """
         meta = {key: getattr(self, key) for key in ("period", "scene_hash", "layout_hash", "about")}
-        meta |= {"format": FORMAT, "names": list(self.plant.names)}
+        meta |= {"format": FORMAT if self.planner is None else PLANNED, "names": list(self.plant.names)}
         arrays = {f"plant_{key}": getattr(self.plant, key) for key in PLANT}
         arrays |= {"K": self.K, "x_bar": self.x_bar, "u_bar": self.u_bar}
         if self.limits is not None:
@@ -357,8 +373,10 @@ def read_npz(path: Path, expected: dict[str, str | None]) -> tuple[dict[str, Any
         raise ControlError(f"{path} does not exist; save the controller first") from None
     except Exception as error:  # zip, json and numpy have errors of their own for damaged files
         raise ControlError(f"{path} is damaged or no controller ({error}); save it again") from error
-    if meta.get("format") != FORMAT:
-        raise ControlError(f"{path} has the format {meta.get('format')}, this version reads {FORMAT}; save it again")
+    if meta.get("format") not in (FORMAT, PLANNED):
+        raise ControlError(
+            f"{path} has the format {meta.get('format')}, this version reads {FORMAT} and {PLANNED}; save it again"
+        )
     kinds = {"layout_hash": "mesh or hand", "scene_hash": "scene"}
     for key, value in expected.items():
         if value is not None and meta.get(key) != value:

@@ -52,7 +52,7 @@ class Estimate:
     """
 
     def __init__(self, filter_: Filter, start: Array) -> None:
-        if not np.isfinite(start).all():
+        if not np.isfinite(start @ start):
             raise ControlError("the first samples of the hand must be finite; begin when q_s and v_s are measured")
         self.filter, self.m = filter_, start
         self.samples: deque[Array] = deque(maxlen=filter_.delay + 1)  # of the hand, at the ticks that y is late
@@ -74,6 +74,8 @@ class Estimate:
         x = self.m + own.M @ off
         if not np.isfinite(x @ x):  # a sample is lost
             x = self.m + own.M @ np.where(np.isfinite(off), off, 0.0)
+            if not np.isfinite(x @ x):  # a sample is absurd
+                x = self.m
         if own.delay == 0:
             self.m = x
             return x

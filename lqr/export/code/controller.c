@@ -43,6 +43,13 @@ void sg_controller_samples(const double x[N], double *y) {
 }
 #endif
 
+/* Whether the squares of x and y add to a number. */
+static int measured(const double *x, const double *y, int n) {
+    double sum = 0;
+    for (int i = 0; i < n; ++i) sum += x[i] * x[i] + y[i] * y[i];
+    return defect(&sum, 1) == 0;
+}
+
 void sg_controller_start(sg_controller *controller) {
     static const sg_controller nothing;
     *controller = nothing;
@@ -71,10 +78,12 @@ static int command(sg_controller *c, const double x[N], int fresh, double u[M]) 
 #if SG_CONTROLLER_OBSERVER
 enum { DELAY = SG_CONTROLLER_DELAY, HAND = SG_CONTROLLER_HAND, P = SG_CONTROLLER_SAMPLES };
 
-/* x becomes x + M (s - C x), where samples that are not finite show nothing; returns their number. */
+/* x becomes x + M (s - C x), where samples that are not finite show nothing; returns their number. Where the result or
+   its square is no number, none shows anything. */
 static int correct(double x[N], const double *hand, const double *y) {
-    double off[P] = {0};
+    double off[P] = {0}, before[N];
     int lost = 0;
+    for (int i = 0; i < N; ++i) before[i] = x[i];
     for (int j = 0; j < N; ++j) add(-x[j], C[j], off, P);
     for (int i = 0; i < P; ++i) {
         double sample = i < HAND ? hand[i] : y ? y[i - HAND] : 0;
@@ -84,6 +93,10 @@ static int correct(double x[N], const double *hand, const double *y) {
             off[i] += sample;
     }
     for (int j = 0; j < P; ++j) add(off[j], CORRECTION[j], x, N);
+    if (!measured(x, x, N)) {
+        for (int i = 0; i < N; ++i) x[i] = before[i];
+        return P;
+    }
     return lost;
 }
 
@@ -140,20 +153,20 @@ static void carry(sg_controller *c, const double *q, const double *v) {
 
 int sg_controller_tick(sg_controller *c, const double q[M], const double v[M], const double *y, double u[M]) {
     double load[M], x[N];
-    int measured = defect(q, M) == 0 && defect(v, M) == 0, lost = 0;
-    if (!c->ticks && !measured) return SG_CONTROLLER_NO_HAND;
+    int hand = measured(q, v, M), lost = 0;
+    if (!c->ticks && !hand) return SG_CONTROLLER_NO_HAND;
 #if SG_CONTROLLER_OBSERVER
     if (!c->ticks)
         for (int i = 0; i < M; ++i) c->x[i] = q[i], c->x[M + i] = v[i];
     lost = estimate(c, q, v, y, x);
 #else
     (void)y;
-    if (measured) carry(c, q, v);
+    if (hand) carry(c, q, v);
     for (int i = 0; i < N; ++i) x[i] = c->x[i];
 #endif
-    int good = command(c, x, SG_CONTROLLER_OBSERVER || measured, load);
+    int good = command(c, x, SG_CONTROLLER_OBSERVER || hand, load);
 #if !SG_CONTROLLER_OBSERVER
-    good = good && measured;
+    good = good && hand;
 #endif
     if (good)
         for (int i = 0; i < M; ++i) c->u[i] = load[i];

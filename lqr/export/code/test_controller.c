@@ -79,6 +79,14 @@ static int withstands(void) {
     if (sg_controller_tick(&controller, q, v, NULL, u) != SG_CONTROLLER_HELD) return 0;
     if (controller.plan.outcomes[SG_PLAN_KEPT] != old + 1 || defect(u, M) != 0) return 0;
 #endif
+    sg_controller_start(&controller); /* numbers whose squares are none leave nothing behind */
+    q[0] = 0;
+    sg_controller_tick(&controller, q, v, NULL, u);
+    q[0] = 1e308, v[0] = -1e308;
+    for (int k = 0; k < 40; ++k) sg_controller_tick(&controller, q, v, NULL, u);
+    q[0] = v[0] = 0;
+    for (int k = 0; k < 40; ++k) status = sg_controller_tick(&controller, q, v, NULL, u);
+    if (status > SG_CONTROLLER_LOST || defect(u, M) != 0 || defect(controller.x, SG_CONTROLLER_N) != 0) return 0;
     return 1;
 }
 

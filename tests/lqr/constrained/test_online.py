@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -229,3 +230,22 @@ def test_plans_that_keep_nothing_are_not_made_again() -> None:
         make_program(unsafe, own.T, robot(found).x_bar, Ticks(own.A, own.B, own.f), 1e-2)
     with pytest.raises(ControlError, match=r"grid = 1 s must be a multiple of the tick of 0.3 s"):
         make_program(found.plan, own.T, robot(found).x_bar, Ticks(own.A, own.B, own.f), 0.3)
+
+
+def test_a_plan_goes_on_without_a_hand_and_its_file_has_a_format_of_its_own(tmp_path: Path) -> None:
+    own = robot(planned())
+    path = own.save(tmp_path / "plan.npz")
+    with np.load(path) as file:
+        assert json.loads(str(file["meta"]))["format"] == 2  # a reader without plans refuses it
+    run = Controller.load(path)
+    run.reset()
+    q, v = run.planner.rest[:2], np.zeros(2)
+    last = run.step(q, v)
+    for _ in range(run.planner.every):
+        assert np.array_equal(run.step(np.full(2, np.nan), v), last)
+    assert [entry.outcome for entry in run.replanner.log] == [Outcome.NEW, Outcome.KEPT]
+    assert "not finite" in run.replanner.log[1].reason
+    plain = replace(own, planner=None).save(tmp_path / "plain.npz")
+    with np.load(plain) as file:
+        assert json.loads(str(file["meta"]))["format"] == 1
+    assert Controller.load(plain).planner is None

@@ -294,3 +294,20 @@ def test_start_state_round_trip(problem: RiccatiProblem, small: tuple[ReducedSys
     assert close(shapes.reduce(problem, expand(shapes, problem, x)), x) < 1e-12  # W'V = I
     state = rest(problem.system)
     assert isinstance(state, PlantState)
+
+
+def test_a_hand_that_is_not_measured_gets_the_load_before(small: tuple[ReducedSystem, Shapes, Array]) -> None:
+    robot, twin = (make_controller(small, np.array([0.4, -0.2])) for _ in range(2))
+    with pytest.raises(ControlError, match="the first samples of the hand must be finite"):
+        robot.step(np.array([np.nan, 0.0]), np.zeros(2))
+    places = 1e-2 * np.random.default_rng(0).standard_normal((9, 2, 2))
+    for tick, (q, v) in enumerate(places):
+        u = robot.step(q, v)
+        if tick == 4:
+            u[:] = 7.0  # the load that is kept is not the caller's
+            last = twin.step(q, v)
+            for bad in (np.nan, np.inf, 1e308):
+                assert np.array_equal(robot.step(np.array([bad, 0.0]), v), last)
+                assert np.array_equal(robot.step(q, np.array([0.0, -bad])), last)
+        else:
+            assert np.array_equal(u, twin.step(q, v))  # no tick of the tissue was lost in between

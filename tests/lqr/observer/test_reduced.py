@@ -113,6 +113,22 @@ def test_estimate_of_its_own_plant_is_exact_with_samples_lost_and_late() -> None
     assert np.abs(x[:2]).min() > 1e-3  # it moved
 
 
+@pytest.mark.parametrize("delay", [0, 2])
+def test_absurd_samples_leave_nothing_behind(delay: int) -> None:
+    found = observed()[1]
+    own = replace(found.controller.observer, delay=delay)
+    robot, twin = (replace(found.controller, observer=own) for _ in range(2))
+    generator = np.random.default_rng(2)
+    for tick in range(60):
+        q, v, y = 1e-3 * generator.standard_normal(2), np.zeros(2), 1e-3 * generator.standard_normal(8)
+        absurd = 20 <= tick < 25
+        with np.errstate(over="ignore", invalid="ignore"):
+            u = robot.step(np.full(2, 1e308) if absurd else q, v, np.full(8, -1e308) if absurd else y)
+        known = twin.step(np.full(2, np.nan) if absurd else q, v, None if absurd else y)
+        assert np.isfinite(u).all()
+        assert delay or np.array_equal(u, known)  # as if all had been lost
+
+
 def test_cost_and_deviations_are_those_of_another_lyapunov_solver() -> None:
     made, found, plant = observed()
     judged, controller, n = found.judged, found.controller, len(plant.A)
