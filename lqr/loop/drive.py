@@ -99,11 +99,10 @@ class ImplicitDrive(GainDrive):
 
     def law(self, n: int, state: TissueState) -> Array:
         """clip(u_bar + K (x_mid - x_bar)) of the step that the midpoint and row n + 1 of q and v have. Collective."""
-        n_s, n_local = len(self.K_q), self.plant.system.layout.n_local
+        n_local = self.plant.system.layout.n_local
         sums = self.gain.K_z.T @ state.array[:n_local] + self.N.T @ self.plant.midpoint.owned()
         q, v = (self.q[n] + self.q[n + 1]) / 2, (self.v[n] + self.v[n + 1]) / 2
-        u = self.offset + self.K_q @ q + self.K_v @ v + total(self.plant.comm, sums)
-        assert u.shape == (n_s,)
+        u = np.asarray(self.offset + self.K_q @ q + self.K_v @ v + total(self.plant.comm, sums))
         return u if self.bound is None else np.clip(u, -self.bound, self.bound)
 
 

@@ -288,7 +288,7 @@ class LoopRun(Stepped):
                         self.advance_to(ts, goal)
                     self.store.flush(self.reached)
                     if self.contact is not None:
-                        self.contact.check_hand(self.drive, before, self.reached + 1)
+                        self.contact.check_hand(self.drive.q, before, self.reached + 1)
                     if goal == 1:
                         self.residual_first = self.residual_last
                 self._check_finite()

@@ -41,6 +41,7 @@ from softgrasp.fem.run.motion import Driven
 ROUNDING = 64 * float(np.finfo(float).eps)  # of a gap, over the coordinates it is computed from [1]
 STILL = 1e-12  # normal velocity of pressed nodes over the largest velocity on the boundary, which is rounding [1]
 MOST = 200  # rounds of a step
+LOOKED_AT = 100_000  # coordinates of held nodes that are looked at together
 STRAIGHT = 1e-8  # motion of a node over the size of the body below which its normal does not turn [1]
 
 
@@ -330,20 +331,28 @@ class Contact:
         forces = self.forces if len(self.rows.node) else np.zeros_like(self.forces)
         return forces.reshape(self.p, self.d)
 
-    def check_hand(self, drive: Driven, begin: int, end: int) -> None:
+    def check_hand(self, q: Array, begin: int, end: int) -> None:
         """See that the nodes that follow the hand are in no obstacle at the steps from begin to before end.
 
-        Raises SolverError: they did; the message names obstacle and time.
+        q: displacement of the hand, (steps + 1, n_s) [m, rad]. Raises SolverError: they did, at that obstacle and time.
         """
-        for n in range(begin, end):
-            x = self.held + (self.held_T @ drive.q[n]).reshape(self.held.shape)
+        each = max(1, LOOKED_AT // max(1, self.held.size))
+        for first in range(begin, end if len(self.held) else begin, each):
+            steps = np.arange(first, min(first + each, end))
+            x = self.held + (q[steps] @ self.held_T.T).reshape(len(steps), *self.held.shape)
+            gaps = []
             for obstacle in self.obstacles:
-                gap = obstacle.gap(x, n * self.dt).min(initial=0.0)
-                if gap < -self.tolerance(x):
-                    raise SolverError(
-                        f"the hand meets obstacle '{obstacle.name}' at t = {n * self.dt:.6g} s: the nodes that it "
-                        f"holds are rigid and {-gap:.2g} m deep in it; change the motion, the obstacle or [contact]"
-                    )
+                shift = np.array([obstacle.shift(n * self.dt) + np.zeros(self.d) for n in steps])[:, None]
+                gaps.append(obstacle.shape.look((x - shift).reshape(-1, self.d))[0].reshape(len(steps), -1).min(axis=1))
+            least, met = np.array(gaps), np.array(gaps).min(axis=0) < -self.tolerance(x)
+            if met.any():
+                n = int(met.argmax())
+                o = int(least[:, n].argmin())
+                raise SolverError(
+                    f"the hand meets obstacle '{self.obstacles[o].name}' at t = {steps[n] * self.dt:.6g} s: the nodes "
+                    f"that it holds are rigid and {-least[o, n]:.2g} m deep in it; change the motion, the obstacle or "
+                    "[contact]"
+                )
 
     def record(self) -> ContactRecord:
         """The record of the run."""

@@ -28,7 +28,7 @@ class ContactDrive:
         """Look at the steps taken. Raises SolverError: see `ForceDrive.check`, or the hand itself met an obstacle."""
         self.drive.check(begin, end)
         if isinstance(self.drive, ForceDrive):
-            self.contact.check_hand(self.drive, begin, end)
+            self.contact.check_hand(self.drive.q, begin, end)
 
 
 class ContactMidpoint(Touching):
@@ -45,7 +45,7 @@ def make_contact(
     hand = drive.step if isinstance(drive, ForceDrive) and model.system.two_way else None
     contact = begin_contact(model, midpoint, steps, hand)
     if isinstance(drive, TableDrive):
-        contact.check_hand(drive, 0, steps + 1)
+        contact.check_hand(drive.q, 0, steps + 1)
     return ContactDrive(drive, contact), contact
 
 
