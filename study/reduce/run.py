@@ -16,12 +16,17 @@ from softgrasp.study.shell import Flags, Session, folder_lock
 def check_scene(scene: Scene) -> tuple[str, ...]:
     """Methods of the scene. Raises SceneError: it keeps no snapshots for a basis. BasisError: a method is unknown."""
     scene.refuse_contact("a reduced model")
-    scene.refuse_frame("a reduced model")
     if scene.output.snapshots not in ("auto", "memory"):
         raise SceneError(
             f"output.snapshots is '{scene.output.snapshots}'; it must be 'memory' for a reduction, which builds its "
             "bases from the states in memory"
         )
+    if scene.effects.frame is not None:
+        if scene.reduction.certify != "off" or scene.reduction.train == "greedy":
+            scene.refuse_frame("a certified model")
+        from softgrasp.study.reduce.turning.measure import turning_methods  # models of another kind
+
+        return turning_methods(scene)
     return measure.chosen_methods(scene)
 
 
@@ -45,6 +50,10 @@ def run_reduce(
         from softgrasp.study.reduce.certified.run import run_certify  # only certified models pay for it
 
         return run_certify(session, scene)
+    if scene.effects.frame is not None:
+        from softgrasp.study.reduce.turning.run import run_turning
+
+        return run_turning(session, scene, names)
     if scene.effects.finite_strain is not None:
         from softgrasp.study.reduce.strain.run import run_strain  # models of another kind
 

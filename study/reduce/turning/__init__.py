@@ -1,0 +1,1 @@
+"""Reduced models in the frame of a turning hand."""
