@@ -277,9 +277,10 @@ class Scene(Shown, Section):
         if self.effects.frame is not None:
             from softgrasp.fem.errors import SceneError  # imports MPI, which the models do without
 
+            more = "" if self.effects.finite_strain is None else " --set effects.finite_strain=false"
             raise SceneError(
                 f"scene '{self.name}': {what} cannot go with effects.frame = 'hand' yet, whose equations are not "
-                "linear in the hand; use --set effects.frame=false for small angles"
+                f"linear in the hand; use --set effects.frame=false{more} for small angles"
             )
 
     @model_validator(mode="after")
