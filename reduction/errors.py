@@ -11,7 +11,7 @@ together instead of several times for each.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
@@ -144,17 +144,23 @@ def span_of(view: View, V: Array, system: BlockSystem, snapshots: Snapshots) -> 
 
 def span_in(view: View, Q: Array, system: BlockSystem, snapshots: Snapshots) -> Span:
     """Snapshots in orthonormal columns Q of a view, local rows, some at a time. Collective."""
+    return spans_in(view, [Q], system, snapshots)[0]
+
+
+def spans_in(view: View, bases: Sequence[Array], system: BlockSystem, snapshots: Snapshots) -> list[Span]:
+    """As :func:`span_in` for several Q: the snapshots are read once for all. Collective."""
     comm, n = system.layout.comm, system.layout.n_local
-    C, sums = [], np.zeros(2)
+    C: list[list[Array]] = [[] for _ in bases]
+    square, rests = 0.0, np.zeros(len(bases))
     for b in column_blocks(snapshots.Z.shape[1]):
         Z = snapshots.Z[:, b]
         X = state_rows(view, system, Z[:n], Z[n:], snapshots.q_s[:, b], snapshots.v_s[:, b])
-        norm = squares(X)
-        C.append(total(comm, Q.T @ X))
-        X -= Q @ C[-1]  # rounding leaves eps |X|, far below the error of any model
-        sums += squares(X), norm
-    rest, square = total(comm, sums)
-    return Span(comm, Q, np.hstack(C), float(rest), float(square))
+        square += squares(X)
+        for i, Q in enumerate(bases):
+            C[i].append(total(comm, Q.T @ X))
+            rests[i] += squares(X - Q @ C[i][-1])  # rounding leaves eps |X|, far below the error of any model
+    square, *rest = total(comm, np.array([square, *rests])).tolist()
+    return [Span(comm, Q, np.hstack(c), left, square) for Q, c, left in zip(bases, C, rest, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -179,11 +185,6 @@ class ModelComparison:
             V = shown_rows(view, self.model, self.small, self.system)
             self._spans[view] = span_of(view, V, self.system, self.snapshots)
         return self._spans[view]
-
-    def at(self, small: EnergySystem, system: BlockSystem, snapshots: Snapshots, energy: Array) -> ModelComparison:
-        """The same family against a run that differs in stiffness alone: the spans of its models stay. Collective."""
-        spans = {view: span_in(view, span.Q, system, snapshots) for view, span in self._spans.items()}
-        return ModelComparison(self.model, small, system, snapshots, energy, spans)
 
     def shown(self, view: View, model: ReducedModel, small: EnergySystem) -> Array:
         """R of :meth:`Span.inside` for the views of a model, kept until the next model. Collective.
@@ -220,6 +221,29 @@ class ModelComparison:
         Raises ModelError: the model is larger than that.
         """
         return self.span(view).projection_error(self.shown(view, model, small) @ with_hand(small))
+
+
+def all_at(
+    known: Sequence[ModelComparison],
+    places: Sequence[EnergySystem],
+    system: BlockSystem,
+    snapshots: Snapshots,
+    energy: Array,
+) -> list[ModelComparison]:
+    """The same families against a run that differs in stiffness alone: the spans of their models stay. Collective.
+
+    Args:
+        places: systems of their largest models at the parameter of that run.
+        system, snapshots, energy: as in :class:`ModelComparison`, of that run.
+    """
+    spans: list[dict[View, Span]] = [{} for _ in known]
+    for view in VIEWS:
+        having = [i for i, each in enumerate(known) if view in each._spans]
+        found = spans_in(view, [known[i]._spans[view].Q for i in having], system, snapshots) if having else []
+        for i, span in zip(having, found, strict=True):
+            spans[i][view] = span
+    pairs = zip(known, places, spans, strict=True)
+    return [ModelComparison(each.model, small, system, snapshots, energy, own) for each, small, own in pairs]
 
 
 def with_hand(small: EnergySystem) -> Array:
