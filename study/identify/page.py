@@ -10,7 +10,7 @@ import numpy as np
 from softgrasp.fem.columns import labels
 from softgrasp.reduction.identify.result import Identified
 from softgrasp.reduction.identify.verdict import BY_CHANCE, direction_in_words
-from softgrasp.study.report import Section, Share, Table, captioned, in_words, percent
+from softgrasp.study.report import Section, Share, Table, captioned, in_words, of_scene, percent
 from softgrasp.study.shell import Session
 from softgrasp.study.shell.session import Page
 
@@ -36,6 +36,7 @@ def compose(answer: Identified, session: Session, fitted: Path, options: str) ->
     figures = captioned(drawn, CAPTIONS)
     sections = [
         Section("", figures=figures[:1]),
+        of_scene(answer.scene),
         value_table(answer).section(
             f"Noise: standard deviation. {kinds_sentence(answer)} Signed parts are those of value / truth - 1.",
             terminal=True, figures=figures[1:2],

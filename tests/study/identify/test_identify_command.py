@@ -73,6 +73,20 @@ def test_values_page_and_scene_of_a_fit_that_stands(measured: Path, tmp_path: Pa
     assert sg.load_scene(out / "fitted.toml").tissue.material.mu == mu["value"]
 
 
+def test_the_page_shows_the_equation_of_the_law_that_was_fitted(tmp_path: Path) -> None:
+    small = ["tissue.cells=[2, 4]", "time.steps=30", "motion.duration=2"]
+    run = sg.simulate(sg.build("paper_forward", [*small, "effects.finite_strain={law='neo-hooke'}"]))
+    data = tmp_path / "camera.csv"
+    np.savetxt(
+        data, np.column_stack([run.times, run.outputs]), "%.6g", ",", header="time [s],tip_x [m],tip_y [m]", comments=""
+    )
+    out = tmp_path / "fit"
+    words = "--fit", "mu", "--noise", NOISE, "--law", "neo-hooke", "--no-pictures", "--out", out, *sets(small)
+    assert call("identify", "paper_forward", data, *words)[0] in (0, 3)  # so coarse a mesh may be refused
+    equation = (out / "report.html").read_text().split('class="equation"')[1].split("<h2")[0]
+    assert "neo-hooke" in equation  # the scene that was given is linear
+
+
 def test_other_commands_take_the_fitted_scene(measured: Path, tmp_path: Path) -> None:
     out = tmp_path / "fit"
     small = ["tissue.cells=[4, 8]", "time.steps=150", "time.end=1.5", "motion.duration=1.5"]
