@@ -38,9 +38,9 @@ def touching_sections(study: ControlStudy, figures: list[tuple[Path, str]]) -> l
     touching = study.loops.touching
     if touching is None:
         return []
-    if touching.run is None or touching.run.contact is None:
-        return [Section("At the obstacles", touching_sentence(study, touching), terminal=True)]
     run = touching.run
+    if run is None or run.contact is None:
+        return [Section("At the obstacles", touching_sentence(study, touching), terminal=True)]
     load = ", ".join(f"{x:.4g}" for x in run.inputs[-2:].mean(axis=0))
     unit = "N" if run.inputs.shape[1] == run.contact.force.shape[2] else "N, N m"
     rows = [
