@@ -1,7 +1,8 @@
 """Reduced models with contact: z = V a, V = [K^-1 G, modes, K^-1 N'], orthonormal in the mass [CB68].
 
 Modes alone miss what a force on a node does next to it: nodal forces come out wrong by their own size. With the static
-response of every node that may touch beside them, the answer to slow forces there is exact.
+response of every node that may touch beside them, the answer to slow forces there is exact. On fine meshes rows of hat
+functions h_j over several nodes replace those of nodes, N_j = sum_i h_j(x_i) N_i / sum_i h_j(x_i): mean gaps are >= 0.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 Ints = NDArray[np.intp]
 ROUNDING = 64 * float(np.finfo(float).eps)  # of a gap, over the coordinates it is computed from [1]
 DEPENDENT = 1e-13  # least share of a direction of the basis in its Gram matrix, scaled [1]
+CROWD = 1.5  # power of the distance from the end by which hat functions crowd there, where pressures are steep [1]
 CHUNK = 256  # instants at which the nodes without a row are looked at in one product
 
 
@@ -49,9 +51,9 @@ class ContactRun(Shown):
     force: Array
     """Mean force of each obstacle on the tissue in each step, impulses included, (steps, obstacles, d) [N]."""
     gap: Array
-    """Least gap of each obstacle to the nodes that have rows, (steps + 1, obstacles) [m]."""
+    """Least gap of each obstacle to the nodes of the rows, (steps + 1, obstacles) [m]; < 0 between hat functions."""
     touching: Ints
-    """Number of nodes that each obstacle presses in each step, (steps, obstacles)."""
+    """Number of rows that each obstacle presses in each step, (steps, obstacles)."""
 
     def card(self) -> Card:
         """Steps and forces."""
@@ -94,6 +96,8 @@ class ContactModel(Shown):
     """V on the boundary, (p d, N)."""
     kept: Ints
     """Numbers of the boundary nodes that have rows, (nodes,)."""
+    hats: tuple[Array, ...]
+    """Shares of these nodes in the rows of each obstacle, (rows, nodes) each [1]."""
     obstacles: tuple[Obstacle, ...]
     """Half-spaces."""
     fall: Array
@@ -120,7 +124,11 @@ class ContactModel(Shown):
         """Dimension and rows."""
         rows = (
             ("dimension", f"N = {self.N}"),
-            ("contact", f"{counted(len(self.kept), 'node')} before {counted(len(self.obstacles), 'half-space')}"),
+            (
+                "contact",
+                f"{counted(len(self.hats[0]), 'row')} on {counted(len(self.kept), 'node')} before "
+                f"{counted(len(self.obstacles), 'half-space')}",
+            ),
         )
         return Card("ContactModel", rows)
 
@@ -153,16 +161,22 @@ class ContactModel(Shown):
             gaps.append(surface.X[self.kept] @ n - offset + q @ lift.T - shift[:, None])
             rates.append(v @ lift.T - speed[:, None])
             normals.append(n)
-        rows, gap, rate = np.vstack(N), np.ascontiguousarray(np.hstack(gaps)), np.ascontiguousarray(np.hstack(rates))
+        hats = self.hats
+        rows = np.vstack([H @ each for H, each in zip(hats, N, strict=True)])
+        gap, rate = (
+            np.ascontiguousarray(np.hstack([x @ H.T for H, x in zip(hats, each, strict=True)]))
+            for each in (gaps, rates)
+        )
         tol = ROUNDING * (float(np.abs(surface.X).max() + np.abs(q).max(initial=0.0)) + self.extent)
         stepper = ContactSteps(self.stiffness, self.D, np.ascontiguousarray(rows), dt)
         a, rate_a, x, y = stepper.march(start, np.ascontiguousarray(c @ self.G.T), gap, rate, tol, engine)
         self._check(a, q, t, tol)
-        shape = (len(self.obstacles), len(self.kept))
-        force: Array = (x + y / dt).reshape(steps, *shape).sum(axis=2)[:, :, None] * np.array(normals)
-        least = (gap + a @ rows.T).reshape(steps + 1, *shape).min(axis=2)
-        touching = (x > 0).reshape(steps, *shape).sum(axis=2)
-        return ContactRun(t, a, rate_a, a @ self.C.T + q @ self.C_s.T, force, least, touching)
+        least = [(each + a @ n.T).min(axis=1) for each, n in zip(gaps, N, strict=True)]
+        ends = np.cumsum([len(H) for H in hats])[:-1]
+        parts = zip(np.split(x + y / dt, ends, axis=1), normals, strict=True)
+        force = np.stack([part.sum(axis=1)[:, None] * n for part, n in parts], axis=1)
+        touching = np.column_stack([(part > 0).sum(axis=1) for part in np.split(x, ends, axis=1)])
+        return ContactRun(t, a, rate_a, a @ self.C.T + q @ self.C_s.T, force, np.column_stack(least), touching)
 
     def _check(self, a: Array, q: Array, t: Array, tol: float) -> None:
         """Raise ModelError where a boundary node without a row is in an obstacle, or any one at the start."""
@@ -185,7 +199,7 @@ class ContactModel(Shown):
                     )
 
 
-def contact_model(model: Model, modes: int = 10, reach: float | None = None) -> ContactModel:
+def contact_model(model: Model, modes: int = 10, reach: float | None = None, rows: int | None = None) -> ContactModel:
     """The tissue in coordinates z = V a, V = [K^-1 G, modes, K^-1 N'] orthonormal in the mass [CB68]. Collective.
 
     Args:
@@ -194,6 +208,8 @@ def contact_model(model: Model, modes: int = 10, reach: float | None = None) -> 
         reach: rows N are kept for boundary nodes that come nearer than this to an obstacle while the undeformed body
             follows the hand of the scene [m]; None: half the distance of boundary nodes. A run in which another node
             enters an obstacle is refused.
+        rows: number of hat functions along each half-space in 2D, at least 2, whose mean gaps are >= 0, for N that does
+            not grow with the mesh; None: a row for each node. Of nodes behind each other the foremost is in them.
 
     Raises:
         ModelError: the scene has other obstacles, no contact or a two-way hand, or no node comes within reach.
@@ -223,8 +239,11 @@ def contact_model(model: Model, modes: int = 10, reach: float | None = None) -> 
     kept = np.flatnonzero(_nearest(surface, obstacles, table, dt) < near)
     if not len(kept):
         raise ModelError(f"no boundary node comes within reach = {near:.3g} m of an obstacle; give a larger reach")
-    rows = _responses(model, surface, kept, obstacles)
-    blocks = [static_columns(system, np.asfortranarray(np.hstack([system.G, rows]))), lowest_modes(system, modes)[1]]
+    if rows is not None:  # a hat goes along one face: of what lies above another node none
+        kept = _foremost(surface.X, kept, obstacles, near)
+    hats = tuple(_hats(surface, kept, o, rows) for o in obstacles)
+    loads = _responses(model, surface, kept, obstacles, hats)
+    blocks = [static_columns(system, np.asfortranarray(np.hstack([system.G, loads]))), lowest_modes(system, modes)[1]]
     V, stiffness = _diagonal(model, np.hstack(blocks))
     seconds["basis"] = time.perf_counter() - begin
     begin = time.perf_counter()
@@ -238,7 +257,7 @@ def contact_model(model: Model, modes: int = 10, reach: float | None = None) -> 
     return ContactModel(
         V, stiffness, (D + D.T) / 2, total(layout.comm, V.T @ system.G),
         total(layout.comm, output_columns(outputs, layout.n_local).T @ V), np.vstack([o.C_s for o in outputs]), surface,
-        total(layout.comm, on), kept, obstacles, system.fall, system.damping.drag,
+        total(layout.comm, on), kept, hats, obstacles, system.fall, system.damping.drag,
         scene.time.start == "equilibrium" and system.gravity is not None, table, dt, layout.extent, seconds,
     )  # fmt: skip
 
@@ -259,13 +278,47 @@ def _nearest(surface: Surface, obstacles: tuple[Obstacle, ...], table: HandTable
     return least
 
 
-def _responses(model: Model, surface: Surface, kept: Ints, obstacles: tuple[Obstacle, ...]) -> Array:
-    """N' of the kept nodes and all normals, each once, local rows (n_local, columns)."""
+def _foremost(X: Array, kept: Ints, obstacles: tuple[Obstacle, ...], distance: float) -> Ints:
+    """The kept nodes with no other one straight before them at rest, towards the obstacle that is nearest to them."""
+    gaps = np.array([o.gap(X[kept]) for o in obstacles])
+    first = np.ones(len(kept), dtype=bool)
+    for j, o in enumerate(obstacles):
+        n, mine = _plane(o)[0], gaps.argmin(axis=0) == j
+        beside = X[kept] - gaps[j][:, None] * n
+        before = gaps[j][None, :] < gaps[j][:, None] - distance
+        close = np.linalg.norm(beside[:, None] - beside[None], axis=2) < distance
+        first &= ~(mine & (before & close).any(axis=1))
+    return kept[first]
+
+
+def _hats(surface: Surface, kept: Ints, obstacle: Obstacle, rows: int | None) -> Array:
+    """Shares of the kept nodes in the rows of a half-space, (rows, nodes) [1].
+
+    Raises ModelError: rows is less than 2, or the tissue is 3D.
+    """
+    if rows is None:
+        return np.eye(len(kept))
+    if surface.X.shape[1] == 3 or rows < 2:
+        raise ModelError(f"rows = {rows}; it must be at least 2, and in 3D every node has a row: leave it out")
+    n = _plane(obstacle)[0]
+    x = surface.X[kept] @ np.array([-n[1], n[0]])
+    s = np.linspace(-1.0, 1.0, rows)
+    even = (1 + np.sign(s) * (1 - (1 - np.abs(s)) ** CROWD)) / 2
+    at = np.unique(x[np.abs(x[:, None] - (x.min() + np.ptp(x) * even)).argmin(axis=0)])  # where nodes are
+    H = np.array([np.interp(x, at, unit) for unit in np.eye(len(at))])
+    return np.asarray(H / H.sum(axis=1, keepdims=True))
+
+
+def _responses(
+    model: Model, surface: Surface, kept: Ints, obstacles: tuple[Obstacle, ...], hats: tuple[Array, ...]
+) -> Array:
+    """N' of the rows, those of equal half-spaces once, local rows (n_local, columns)."""
     d = surface.X.shape[1]
-    normals = np.unique([_plane(o)[0] for o in obstacles], axis=0)
-    whole = np.zeros((len(surface.dofs), len(kept) * len(normals)))
-    for j, (node, n) in enumerate((node, n) for n in normals for node in kept):
-        whole[node * d : (node + 1) * d, j] = n
+    normals = [_plane(o)[0] for o in obstacles]
+    each = [j for j, n in enumerate(normals) if not any(np.array_equal(n, other) for other in normals[:j])]
+    whole = np.zeros((len(surface.dofs), sum(len(hats[j]) for j in each)))
+    loads = np.hstack([np.einsum("ri,d->idr", hats[j], normals[j]).reshape(len(kept) * d, -1) for j in each])
+    whole[(kept[:, None] * d + np.arange(d)).ravel()] = loads
     result = np.zeros((model.system.layout.n_local, whole.shape[1]), order="F")
     result[surface.rows] = whole[surface.mine]
     return result

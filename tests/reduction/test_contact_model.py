@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,41 @@ def test_thirty_columns_repeat_a_motion_they_were_not_made_for() -> None:
     assert run.gap.min() > -1e-14  # of a body of 2 m
     # as far as z from the full run, relative to the deformation
     assert np.abs(run.outputs - full.outputs).max() < 2e-3 * np.abs(full.outputs - full.outputs_rigid).max()
+
+
+@pytest.mark.slow
+@pytest.mark.serial
+def test_hats_over_nodes_keep_the_dimension_on_a_fine_mesh() -> None:
+    fine = "tissue.cells=[60, 120]"
+    rom = contact_model(landing(MADE, *LONG, fine), rows=16)
+    model = landing(OTHER, *LONG, fine)
+    begin = time.process_time()
+    full = simulate(model)
+    spent = time.process_time() - begin
+    begin = time.process_time()
+    run = rom.run(full.q_s, full.v_s, rom.dt)
+    spent /= time.process_time() - begin
+    z, force = errors(full, run, rom.V, MPI.COMM_SELF)
+    assert rom.N <= 30
+    assert len(rom.kept) == 61  # those of the face, without the sides
+    assert z < 1e-3  # asked for; measured 9.7e-4
+    assert force < 1e-2  # asked for; measured 6.2e-3
+    assert spent > 10  # asked for; of the whole run, whose setup is a small part
+    # between hat functions nodes sink in, by a part of the deformation of 0.1 m
+    assert -1e-3 < run.gap.min() < 0
+
+
+@pytest.mark.serial
+def test_hats_at_every_node_are_the_rows_of_nodes() -> None:
+    model = landing(MADE, "tissue.cells=[5, 10]", SHORT[1])
+    nodes, few, all_of_them = (contact_model(model, 8, rows=rows) for rows in (None, 4, 200))
+    one, other, coarse = (rom.run(*rom.motion(), rom.dt) for rom in (nodes, all_of_them, few))
+    assert few.N == nodes.N - 2
+    assert np.abs(one.outputs - other.outputs).max() < 1e-9  # the same span, of a path of 0.5 m
+    assert np.abs(one.force - other.force).max() < 1e-6 * one.force.max()
+    assert np.linalg.norm(coarse.force - one.force) < 5e-2 * np.linalg.norm(one.force)
+    with pytest.raises(ModelError, match=r"rows = 1; it must be at least 2"):
+        contact_model(model, 8, rows=1)
 
 
 @pytest.mark.ranks(3)
@@ -109,7 +145,7 @@ def test_what_it_cannot_do_is_refused() -> None:
     with pytest.raises(ModelError, match=r"no boundary node comes within reach = 0.001 m"):
         contact_model(landing("motion={profile='hold'}", *SHORT), reach=1e-3)
     rom = contact_model(model)
-    inside = dataclasses.replace(rom, kept=rom.kept[:2])
+    inside = dataclasses.replace(rom, kept=rom.kept[:2], hats=(np.eye(2),))
     with pytest.raises(ModelError, match=r"a boundary node without a row is .* m in obstacle 'table'; give .* reach"):
         inside.run(*rom.motion(), rom.dt)
     q, v = rom.motion()

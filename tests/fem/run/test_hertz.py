@@ -1,4 +1,4 @@
-"""A disc pressed into a block at rest against Hertz: a^2 = 4 P R / (pi E*), p = p_0 sqrt(1 - (x / a)^2) in plane strain."""
+"""A disc pressed into a block against Hertz: a^2 = 4 P R / (pi E*), p = p_0 sqrt(1 - (x / a)^2) in plane strain."""
 
 from __future__ import annotations
 
