@@ -204,13 +204,12 @@ def assemble(
     inventory.forms += list(forms)
     result = []
     for i, name in enumerate(space.layers):
-        parts = {}
+        parts: dict[str, Component] = {}
         for key, form in forms.items():
             parts[key] = blocks(form, i)
             inventory.operators.append(f"{key}[{name}]")
-        for key in ("K_mu", "K_lambda"):
-            parts.setdefault(key, parts["M_1"])
-        result.append(LayerBlocks(name, **parts))
+        M_1 = parts["M_1"]
+        result.append(LayerBlocks(name, parts.get("K_mu", M_1), parts.get("K_lambda", M_1), M_1))
     return tuple(result)
 
 

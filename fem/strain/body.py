@@ -233,7 +233,7 @@ class HyperelasticBody:
             self.A.setValuesCSR(self.indptr, self.columns, values)
             self.A.assemble()
             self.A.ptap(self.points.B, self.product)
-        result = self.product
+        result: PETSc.Mat = self.product
         if self.K is not None:
             self.K.zeroEntries()
             self.K.axpy(1.0, self.product, PETSc.Mat.Structure.SUBSET)

@@ -39,12 +39,12 @@ def touching_sections(study: ControlStudy, figures: list[tuple[Path, str]]) -> l
     if touching is None:
         return []
     run = touching.run
-    if run is None or run.contact is None:
+    if run is None or (contact := run.contact) is None:
         return [Section("At the obstacles", touching_sentence(study, touching), terminal=True)]
     load = ", ".join(f"{x:.4g}" for x in run.inputs[-2:].mean(axis=0))
-    unit = "N" if run.inputs.shape[1] == run.contact.force.shape[2] else "N, N m"
+    unit = "N" if run.inputs.shape[1] == contact.force.shape[2] else "N, N m"
     rows = [
-        *contact_rows(run.contact),
+        *contact_rows(contact),
         ("distance to the target", f"{touching.distance:.3g} m at the end"),
         ("load on the hand", f"({load}) {unit} at the end, mean of two steps"),
         ("cost of the run", f"{run.cost[-1]:.6g}, {percent(touching.cost_excess)} more than without obstacles"),
@@ -56,11 +56,11 @@ def touching_sections(study: ControlStudy, figures: list[tuple[Path, str]]) -> l
 def touching_sentence(study: ControlStudy, touching: TouchingLoop) -> str:
     """What the obstacles do to the loop."""
     run = touching.run
-    if run is None or run.contact is None:
+    if run is None or (contact := run.contact) is None:
         return f"With the obstacles the run of the optimal gain fails: {touching.reason}."
-    if not run.contact.touching.any():
+    if not contact.touching.any():
         return "The tissue touches no obstacle under the optimal gain."
-    force = float(np.linalg.norm(run.contact.force_end.sum(axis=0)))
+    force = float(np.linalg.norm(contact.force_end.sum(axis=0)))
     free = float(study.distance(study.loops.full)[-1])
     presses = f"the obstacles press with {force:.4g} N" if force > 0 else "nothing touches"
     return (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -71,8 +72,8 @@ def measure_turning(
                 continue
             run, small = replay_turning(rom, full), rom.at(full.dt)
             errors = errors_turning(rom, run, full)
-            setup = median_processor_seconds(comm, lambda rom=rom: rom.at(full.dt), RUNS)
-            online = median_processor_seconds(comm, lambda small=small: small.run(full.hand, start=start), RUNS)
+            setup = median_processor_seconds(comm, partial(rom.at, full.dt), RUNS)
+            online = median_processor_seconds(comm, partial(small.run, full.hand, start=start), RUNS)
             missed = float(np.abs(run.force - force).max() / max(np.abs(force).max(), 1e-300))
             points.append(TurningPoint(
                 name, N, errors.z, errors.v, errors.energy_norm, missed, sum(rom.seconds.values()), setup, online,
