@@ -105,6 +105,17 @@ def model_errors(rom: ReducedModel, model: Model, run: Trajectory) -> Any:
     return _free(figure)
 
 
+def _written(file: str | Path, content: bytes) -> Path:
+    """The file, written where there is something: what rank 0 drew is not replaced by another rank's nothing."""
+    if content:
+        Path(file).write_bytes(content)
+    return Path(file)
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.0f} kB"
+
+
 @dataclass(frozen=True)
 class Film:
     """An animated picture; notebooks show it."""
@@ -112,12 +123,11 @@ class Film:
     gif: bytes  # the file
 
     def save(self, file: str | Path) -> Path:
-        """Write it as GIF and return its path."""
-        Path(file).write_bytes(self.gif)
-        return Path(file)
+        """Write it as GIF and return its path; an empty film, of a rank above 0, writes nothing."""
+        return _written(file, self.gif)
 
     def __repr__(self) -> str:
-        return f"Film of {len(self.gif) / 1e6:.1f} MB; save it by film.save('move.gif')"
+        return f"Film of {_size(len(self.gif))}; save it by film.save('move.gif')"
 
     def _repr_html_(self) -> str:
         return f'<img alt="the move" src="data:image/gif;base64,{base64.b64encode(self.gif).decode()}">'
@@ -130,12 +140,11 @@ class View:
     html: str  # the page
 
     def save(self, file: str | Path) -> Path:
-        """Write it as a page of the browser and return its path."""
-        Path(file).write_text(self.html, encoding="utf-8")
-        return Path(file)
+        """Write it as a page of the browser and return its path; an empty page, of a rank above 0, writes nothing."""
+        return _written(file, self.html.encode())
 
     def __repr__(self) -> str:
-        return f"View of {len(self.html) / 1e6:.1f} MB; save it by view.save('move.html')"
+        return f"View of {_size(len(self.html))}; save it by view.save('move.html')"
 
     def _repr_html_(self) -> str:
         look = 'style="width:100%;height:30rem;border:0" title="the move, to turn and play"'

@@ -54,6 +54,7 @@ ELSEWHERE = {  # what no test here can run, or what another one does
     r"apt install .*|conda env .*|docker .*": "they need a network and rights",
     r"(python3 -m venv|\.venv/bin/pip|env/bin/pip) .*": "tests/test_project.py installs the wheel",
     r"module load .*|export .*|srun .*|env/bin/softgrasp doctor|mu=.*|out=.*|\[ -d .*": "a cluster's",
+    r"status=\$\?|if \[ .*; then|scontrol .*|fi|exit \$status": "test_an_array_job_waits_again_only_if_stopped",
 }
 
 
@@ -130,6 +131,32 @@ def test_jobs_of_the_cluster_page_have_real_scenes_and_keys(tmp_path: Path, monk
         command = typer.main.get_command(app).commands[words[0]]  # type: ignore[attr-defined]
         context = command.make_context(job, words[1:], resilient_parsing=False)
         load_scene(find_scene(context.params["scene"]), context.params.get("set_") or [])
+
+
+def test_an_array_job_waits_again_only_if_stopped(tmp_path: Path) -> None:
+    """The page's own script in bash, with a run and a queue that only say what they were asked for."""
+    (job,) = [text for _, text in blocks("") if "scontrol" in text]
+    assert all(text.startswith("#!/bin/bash\n") for _, text in blocks("") if "#SBATCH" in text)  # sbatch asks for it
+    (tmp_path / "env" / "bin").mkdir(parents=True)
+    folder = tmp_path / "sweep" / "2"
+    stubs = f'srun() {{ echo "$@"; mkdir -p {folder}/$LEAVES; return $ENDS; }}\nscontrol() {{ echo "$@"; }}\n'
+
+    def ended(leaves: str, ends: int, restarts: int) -> tuple[int, list[str]]:
+        given = {"SLURM_ARRAY_TASK_ID": "2", "SLURM_ARRAY_JOB_ID": "7", "SLURM_RESTART_COUNT": str(restarts)}
+        given |= {"SCRATCH": str(tmp_path), "HOME": str(tmp_path), "LEAVES": leaves, "ENDS": str(ends)}
+        done = subprocess.run(["bash", "-c", stubs + job], env=os.environ | given, capture_output=True, text=True)
+        assert done.stderr == ""
+        return done.returncode, done.stdout.splitlines()
+
+    status, said = ended("", 1, 0)  # refused, without a restart file
+    assert (status, len(said)) == (1, 1)
+    assert "tissue.material.mu=60 " in said[0]
+    assert not said[0].endswith("--resume")
+    assert ended("checkpoint", 1, 0)[1][1:] == ["requeue 7_2"]  # stopped
+    status, said = ended("checkpoint", 0, 1)  # went on, and ended
+    assert (status, len(said)) == (0, 1)
+    assert said[0].endswith("--resume")
+    assert len(ended("checkpoint", 1, 20)[1]) == 1  # not for ever
 
 
 def small(words: list[str]) -> list[str]:

@@ -123,7 +123,9 @@ def test_figures_show_what_the_objects_hold(objects: dict[str, Any], tmp_path: P
     assert view.save(tmp_path / "move.html").read_text() == view.html
     assert '<canvas id="c"' in view.html
     assert re.search(r"relative to the hand \[m?m\]", view.html)
-    assert re.fullmatch(r"View of \d.\d MB; .*", repr(view))
+    assert re.fullmatch(r"View of \d+ kB; .*", repr(view))
+    for empty in (replace(view, html=""), replace(film, gif=b"")):  # of a rank above 0
+        assert empty.save(tmp_path / "move.html").read_text() == view.html
     assert html.unescape(view._repr_html_().split('srcdoc="')[1].split('">')[0]) == view.html
 
 

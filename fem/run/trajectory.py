@@ -105,13 +105,13 @@ class Trajectory(Shown, FullOrderRun):
     def animate(self, model: Model) -> Any:
         """The move on the mesh of its model, as an animated picture with ``save``. Collective.
 
-        Raises SoftgraspError: the run kept no snapshots.
+        Rank 0 has the picture. Raises SoftgraspError: the run kept no snapshots.
         """
         return drawn("animation", self, model)
 
     def view3d(self, model: Model) -> Any:
         """The move on the mesh of its model to turn, zoom and play in a notebook, with ``save`` as a page. Collective.
 
-        Obstacles are not drawn. Raises SoftgraspError: the run kept no snapshots.
+        Rank 0 has the page. Obstacles are not drawn. Raises SoftgraspError: the run kept no snapshots.
         """
         return drawn("view3d", self, model)

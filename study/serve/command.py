@@ -21,8 +21,8 @@ def serve(
     """Let tools of uncertainty quantification ask a certified model, by the UM-Bridge protocol.
 
     Model "forward" gives the outputs over time with gradient and Jacobian, "bound" the errors of the outputs, proved
-    unless the model was trained with certify = "estimate". A
-    material whose error is above the tolerance of the model is refused.
+    unless the model was trained with certify = "estimate". A material whose error is above the tolerance of the
+    model is refused.
 
     Example: softgrasp serve out/paper_forward-reduce/models/certified.h5
     """
