@@ -8,7 +8,7 @@ That of an obstacle on a known path moves with it, n.(y - s(t)) >= h(n).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import islice, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -174,16 +174,24 @@ def _cheapest(horizon: Horizon, task: Task, level: float) -> Plan:
     moving = [i for i, shape in enumerate(task.shapes) if not isinstance(shape, HalfSpace)]
     on_way = [i for i in moving if _left(task.shapes[i], task, first[i], seen[i]).min() < 0]
     still, d = task.places - task.places.mean(axis=0), task.places.shape[1]
-    ways = list(product((1, -1, 2, -2)[: 2 * (d - 1)], repeat=len(on_way)))
+    ways = _ways(d, len(on_way))
     plans: list[Plan] = []
-    for sides in ways[:MOST_WAYS]:
+    for sides in ways:
         normals = list(first)
         for i, side in zip(on_way, sides, strict=True):
             normals[i] = past(task.shapes[i], seen[i][:, 0].mean(axis=1), still, side)
         plans.append(_rounds(horizon, task, np.array(normals).reshape(-1, horizon.steps, d), level, sides))
     best = min(plans, key=lambda p: (p.depth > 0, p.depth if p.depth > 0 else float(p.c @ p.c)))
     tried = tuple((p.sides, float(p.c @ p.c), p.depth) for p in plans)
-    return replace(best, tried=tried, untried=len(ways) - len(plans))
+    return replace(best, tried=tried, untried=(2 * (d - 1)) ** len(on_way) - len(plans))
+
+
+def _ways(d: int, count: int) -> list[tuple[int, ...]]:
+    """The first sides of obstacles on the way, at most :data:`MOST_WAYS`: each obstacle is passed on every side."""
+    sides = (1, -1, 2, -2)[: 2 * (d - 1)]
+    turns = product(range(len(sides)), repeat=max(count - 1, 0))
+    ways = (tuple(sides[(k + t) % len(sides)] for t in (0, *turn)) for turn in turns for k in range(len(sides)))
+    return list(islice(ways, MOST_WAYS)) if count else [()]
 
 
 def _left(shape: Shape, task: Task, normals: Array, body: Array) -> Array:

@@ -58,6 +58,8 @@ class Task:
 def after_paths(plant: HeldPlant, task: Task, steps: int, longest: int) -> int:
     """Intervals, at least ``steps``, after which no obstacle comes nearer to the body at the target.
 
+    One that passes through the target has to leave room there first, where it does within ``longest``.
+
     Raises ControlError: there are more than ``longest``.
     """
     for i, name in enumerate(task.names):
@@ -67,9 +69,16 @@ def after_paths(plant: HeldPlant, task: Task, steps: int, longest: int) -> int:
         if np.isfinite(path.end):
             steps = max(steps, int(np.ceil(path.end / plant.grid - 1e-9)))
         else:  # at a constant velocity, for ever
-            ends = (k * plant.grid for k in range(first, longest + 1))
-            away = (task.separate(i, task.places, t)[0] @ path(t, 1) <= 0 for t in ends)
-            steps = next((first + k for k, leaves in enumerate(away) if leaves), longest + 1)
+            leaving = None
+            for k in range(first, longest + 1):
+                normal = task.separate(i, task.places, k * plant.grid)[0]
+                if normal @ path(0.0, 1) <= 0:
+                    leaving = k if leaving is None else leaving
+                    if _free_at(task, i, normal, k * plant.grid).min() > 0:
+                        steps = k
+                        break
+            else:
+                steps = longest + 1 if leaving is None else leaving
         if steps > longest:
             raise ControlError(
                 f"obstacle {name} moves towards the body at the target until the end of the longest plan, of "
@@ -81,9 +90,9 @@ def after_paths(plant: HeldPlant, task: Task, steps: int, longest: int) -> int:
 def at_target(task: Task, t: float) -> list[tuple[Array, Array]]:
     """Normal and free way of every node at the target, from time t on; raises ControlError where there is none."""
     result = []
-    for i, (shape, name) in enumerate(zip(task.shapes, task.names, strict=True)):
+    for i, name in enumerate(task.names):
         normal, gap = task.separate(i, task.places, t)
-        free = free_ways(shape, task, normal[None])[0] - normal @ task.shifts(i, np.asarray(t))
+        free = _free_at(task, i, normal, t)
         if not free.min() > 0:
             need = gap - float(free.min())
             raise ControlError(
@@ -93,6 +102,12 @@ def at_target(task: Task, t: float) -> list[tuple[Array, Array]]:
             )
         result.append((normal, free))
     return result
+
+
+def _free_at(task: Task, i: int, normal: Array, t: float) -> Array:
+    """Way of every node at the target to the half-space of an obstacle at a time, less clearance and margin."""
+    free = free_ways(task.shapes[i], task, normal[None])[0]
+    return np.asarray(free - normal @ task.shifts(i, np.asarray(t)))
 
 
 def free_ways(shape: Shape, task: Task, normals: Array) -> Array:
@@ -117,7 +132,8 @@ def path_turns(horizon: Horizon, task: Task, i: int, normals: Array) -> Array | 
     if path is None:
         return 0.0
     ends = instants(horizon, len(normals))
-    most = [[path.fastest_turn(a, b) for a, b in pairwise(row)] for row in ends.tolist()]
+    still = np.zeros(normals.shape[1])  # from its end on
+    most = [[path.fastest_turn(a, b) if a < path.end else still for a, b in pairwise(row)] for row in ends.tolist()]
     return np.asarray(np.einsum("kd,kid->ki", np.abs(normals), np.array(most)))
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,11 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import Stopwatch, build
 from softgrasp.fem.obstacles.obstacle import Spline, Uniform
+from softgrasp.fem.obstacles.shapes import Ball
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.constrained.horizon import held_cost
+from softgrasp.lqr.constrained.plan import MOST_WAYS, _ways
+from softgrasp.lqr.constrained.task import after_paths, at_target, path_turns
 from softgrasp.lqr.design.constrained import PlannedControl, plan_control
 from softgrasp.lqr.design.feedback import design
 from softgrasp.lqr.plant.checks import ControlError
@@ -85,6 +89,44 @@ def test_acceleration_of_a_path_is_bounded() -> None:
 def test_an_obstacle_that_keeps_coming_is_refused() -> None:
     with pytest.raises(ControlError, match="obstacle disc1 moves towards the body at the target until the end"):
         planned("paper_obstacle", *SMALL, CROSSING.replace("[0.0, -0.5]", "[0.01, 0.0]"))
+
+
+def test_an_obstacle_that_passes_through_the_target_has_to_leave_room_there() -> None:
+    plan = planned("paper_obstacle", *SMALL, CROSSING, online=True).plan
+    plant, low, high = plan.horizon.plant, *(getattr(plan.task.places, end)(axis=0) for end in ("min", "max"))
+    ball = Ball(np.array([low[0] / 2 + high[0] / 2, high[1] + 20.0]), 0.5)
+    task = replace(plan.task, shapes=(ball,), names=("ball",), paths=(Uniform(np.array([0.0, -0.5])),))
+    gone = (20.0 + 2.0 + 0.5) / 0.5  # its top is below the body, of height 2 m, from then on [s]
+    steps = after_paths(plant, task, 1, 400)
+    assert gone < steps * plant.grid < gone + 2 * plant.grid  # clearance and margin are less than an interval's way
+    assert at_target(task, steps * plant.grid)[0][1].min() > 0
+    soon = int(gone / plant.grid)  # it leaves, and is still in the body
+    with pytest.raises(ControlError, match="at the target the gap to obstacle ball"):
+        at_target(task, after_paths(plant, task, 1, soon) * plant.grid)
+
+
+def test_a_path_that_has_ended_needs_no_margin() -> None:
+    horizon = planned("paper_obstacle", *SMALL, CROSSING, online=True).plan.horizon
+    end = 2 * horizon.plant.grid
+    spline = scipy.interpolate.CubicSpline([0.0, end], [[0.0, 0.0], [0.0, -3.0]], bc_type="clamped")
+    task = replace(planned("paper_obstacle", *SMALL, CROSSING, online=True).plan.task, paths=(Spline(spline),))
+    turns = path_turns(horizon, task, 0, np.tile([0.0, 1.0], (4, 1)))
+    assert turns[:2].max() == pytest.approx(6 * 3.0 / end**2)  # of s = 3 t^2 - 2 t^3
+    assert not turns[2:].any()
+
+
+@pytest.mark.parametrize(("d", "count"), [(2, 4), (2, 40), (3, 2), (3, 30)])
+def test_every_obstacle_is_passed_on_every_side_where_not_all_ways_are_tried(d: int, count: int) -> None:
+    ways = _ways(d, count)
+    assert len(set(ways)) == MOST_WAYS
+    for sides in zip(*ways, strict=True):
+        assert set(sides) == set((1, -1, 2, -2)[: 2 * (d - 1)])
+
+
+def test_few_obstacles_are_passed_in_all_ways() -> None:
+    assert _ways(3, 0) == [()]
+    assert set(_ways(2, 3)) == set(product((1, -1), repeat=3))
+    assert set(_ways(3, 1)) == {(1,), (-1,), (2,), (-2,)}
 
 
 SPACE = ("tissue.cells=[2,2,2]", "control.constraints.parts=2", "control.loop.rate=1000")
