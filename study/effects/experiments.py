@@ -112,12 +112,15 @@ class SwitchRuns:
     def shown(self, on: Names, forced: bool) -> Names:
         """Those of the effects that a run can show: a motion that is prescribed feels no reaction.
 
-        Nor does it feel the freedom to turn where it prescribes no turn: the load has zeros there.
+        Nor does it feel the freedom to turn where it prescribes no turn: the load has zeros there. Under the force that
+        would make the motion the hand turns by the reaction alone, for M_hand joins no turn to a shift.
         """
         motion = self.scene.motion
-        if forced or motion.drive == "force":
+        if motion.drive == "force":
             return on
         turns = motion.csv is not None or any((motion.target or [])[self.scales.dimension :])
+        if forced:
+            return on if turns or "reaction" in on else on - {"rotation"}
         return on - ({"reaction"} if turns else {"reaction", "rotation"})
 
     def of(self, on: Names, forced: bool = False) -> Displacements:

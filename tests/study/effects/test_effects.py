@@ -347,6 +347,21 @@ def test_a_prescribed_motion_feels_neither_reaction_nor_the_freedom_to_turn(comm
             assert close(simulate(other).outputs, plain.outputs) < 1e-12  # vectors of three columns round otherwise
 
 
+@pytest.mark.ranks(2)
+def test_under_a_force_a_hand_without_reaction_does_not_turn(comm: MPI.Intracomm) -> None:
+    """So the freedom to turn needs no run of its own there; beside the reaction it does."""
+    model = build(make_scene(QUICK, CONTROL, hand={"inertia": 3.0}), comm=comm)
+    runs = SwitchRuns(model.scene, SCALES, {frozenset(): model})
+    for base in (frozenset[str](), frozenset({"gravity", "damping"})):
+        plain, other = (simulate(runs.model(on), force=runs.force) for on in (base, base | {"rotation"}))
+        assert runs.shown(base | {"rotation"}, True) == base
+        assert not other.q_s[:, 2].any()
+        assert close(other.outputs, plain.outputs) < 1e-12  # vectors of three columns round otherwise
+    felt = frozenset({"reaction", "rotation"})
+    assert runs.shown(felt, True) == felt
+    assert simulate(runs.model(felt), force=runs.force).q_s[:, 2].any()
+
+
 def test_an_effect_may_need_two_partners_and_a_force() -> None:
     tried = ("gravity", "damping", "reaction", "rotation")
 
