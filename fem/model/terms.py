@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from numbers import Real
 from typing import Any, Literal, get_args
@@ -120,6 +121,7 @@ def term_blocks(
     Raises SceneError: a form cannot be made, is zero or not symmetric, or joins cells across facets.
     """
     comm, found, materials = space.layout.comm, list[LayerBlocks](), list[LayerMaterial]()
+    scene._terms = tuple(map(copy, scene._terms))  # with digests on this mesh; another model has the same terms too
     beta = 0.0 if scene.effects.damping is None else rows[-1].beta
     nothing: Component | None = None
     for term in scene._terms:

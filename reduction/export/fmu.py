@@ -88,19 +88,23 @@ def write_archive(path: Path, texts: dict[str, str], face: Face, sources: tuple[
         sources: names of those that are compiled.
 
     Raises:
-        ModelError: no C compiler.
+        ModelError: no C compiler, or two variables have one name.
         ResourceError: the file cannot be written; what was there stays.
     """
     texts = texts | {file.name: file.read_text() for file in FMI.iterdir() if file.suffix in (".c", ".h")}
     token = "{" + hashlib.sha256("\0".join(f"{k}\0{v}" for k, v in sorted(texts.items())).encode()).hexdigest() + "}"
     texts["token.h"] = f'#define TOKEN "{token}"\n'
     texts["buildDescription.xml"] = _text(_build(sources))
+    description = _description(face, token)
+    names = [each.get("name") for each in description.iterfind("ModelVariables/*")]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ModelError(f"two variables of the FMU are called {twice[0]}; rename the output or the own parameter")
     fresh = path.with_name(f"new-{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         note(path)
         with zipfile.ZipFile(fresh, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("modelDescription.xml", _text(_description(face, token)))
+            archive.writestr("modelDescription.xml", _text(description))
             for name, text in sorted(texts.items()):
                 archive.writestr(f"sources/{name}", text)
             archive.writestr(f"binaries/{platform.machine()}-linux/{NAME}.so", _compiled(texts, sources))

@@ -107,6 +107,17 @@ def test_the_hash_knows_where_a_term_acts():
 
 
 @pytest.mark.serial
+def test_a_term_of_two_models_leaves_each_its_hash():
+    """Its digest is that on a mesh; a run, a saved model and a restart file are found by the hash of the first."""
+    bed = sg.Term("bed", on_boundary, 30.0)
+    first = sg.build("paper_forward", KEYS, terms=[bed])
+    before = first.scene_hash
+    sg.build("paper_forward", ["tissue.cells=[3, 5]"], terms=[bed])
+    assert first.scene_hash == before == sg.build("paper_forward", KEYS, terms=[bed]).scene_hash
+    assert bed.digest == ""
+
+
+@pytest.mark.serial
 def test_keys_beside_a_loaded_scene_are_refused_with_terms_too():
     scene = sg.build("paper_forward", ["tissue.cells=[2, 4]"]).scene
     with pytest.raises(sg.fem.SceneError, match="need the file or the name of a scene"):

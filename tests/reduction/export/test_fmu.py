@@ -16,8 +16,8 @@ import pytest
 import scipy.linalg
 
 from softgrasp.reduction.export import write_fmu
-from softgrasp.reduction.export.affine import AffinePlant, affine_plant
-from softgrasp.reduction.export.fmu import CONSTANT, INPUT, OUTPUT, STATE
+from softgrasp.reduction.export.affine import AffinePlant, Label, affine_plant
+from softgrasp.reduction.export.fmu import CONSTANT, INPUT, OUTPUT, STATE, Face, write_archive
 from softgrasp.reduction.online import Stepper
 from softgrasp.reduction.system import ModelError
 from tests.helpers.exported import MODELS, state_matrices
@@ -223,6 +223,15 @@ def test_sanitizers_are_silent(unpacked: Path) -> None:
     subprocess.run(["cc", *flags, "main.c", "plant.c", "-o", "main"], cwd=folder, check=True)
     done = subprocess.run(["./main"], cwd=folder, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("name", ["time", "w_1", "der_w_2"])
+def test_two_variables_of_one_name_are_refused(tmp_path: Path, name: str) -> None:
+    """An own parameter may be called like what every FMU has; FMI asks for names that differ."""
+    face = Face("a plant", 1e-3, (), (), ((0, Label(name, ""), 1.0),), (0.0, 0.0))
+    with pytest.raises(ModelError, match=f"two variables of the FMU are called {name}; rename the output or the own"):
+        write_archive(tmp_path / "plant.fmu", {}, face)
+    assert not list(tmp_path.iterdir())
 
 
 def test_no_compiler_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
