@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -140,7 +141,7 @@ class Explanation:
     snapshot_bytes: int  # memory of these states over all ranks [byte]
     mesh: MeshReport  # singular ends, and the error they leave
     coarser: int  # unknowns of the coarser copy of a large mesh that gives modes, sag and estimate [1]; 0: none
-    built: bool  # whether the mesh itself was; else its sizes are computed, to three digits
+    built: bool  # whether the mesh itself was; else its sizes are computed: unknowns to 1 %, entries to 10 %
     dimension: int  # 2 or 3
     plan: PlanSizes | None = None  # of the plan past obstacles that `control` makes; None where it makes none
 
@@ -182,13 +183,24 @@ def _lattice(scene: Scene) -> int:
     return math.prod(scene.tissue.order * n + 1 for n in scene.tissue.cells or [])
 
 
+def _pairs(scene: Scene) -> int:
+    """Pairs of nodes of a box of even simplices that share one, (i, j) and (j, i), those of a node with itself too."""
+    sides = [scene.tissue.order * n + 1 for n in scene.tissue.cells or []]
+    steps = product((0, 1), repeat=len(sides))
+    return 2 * sum(math.prod(n - o for n, o in zip(sides, step, strict=True)) for step in steps) - math.prod(sides)
+
+
 def sizes_from(copy: Model, scene: Scene) -> ModelSizes:
-    """Sizes of a box from those of its copy on fewer cells, three digits of the unknowns and entries. Collective."""
+    """Sizes of a box from those of its copy on fewer cells. Collective.
+
+    Measured: unknowns to 0.1 % in 2D and 1 % in 3D; entries to 0.5 % in 2D and, of quadratic cells in 3D, 10 %.
+    """
     sizes, d = model_sizes(copy), copy.system.layout.dimension
-    nodes = _lattice(scene)
+    nodes, linked = _lattice(scene), _pairs(scene) / _pairs(copy.scene)  # nodes of the boundary have fewer neighbours
     held = (d * sizes.nodes - sizes.n_e) * (nodes / sizes.nodes) ** ((d - 1) / d)  # the zone is a surface
     n_e = float(f"{d * nodes - held:.2e}")
-    nonzeros = float(f"{sizes.nonzeros * n_e / sizes.n_e:.2e}")
+    free = (n_e / nodes) / (sizes.n_e / sizes.nodes)
+    nonzeros = float(f"{sizes.nonzeros * linked * free:.1e}")
     return replace(
         sizes, n_e=int(n_e), states=2 * (sizes.n_s + int(n_e)), cells=box_simplices(scene.tissue.cells or []),
         nodes=nodes, nonzeros=int(nonzeros),

@@ -68,6 +68,8 @@ def sections(result: Explanation) -> list[Section]:
     modes = ("mode", "omega [1/s]", "period [s]", "dt / period")
     whose = "Modes, sag" if result.built else "So large a mesh is not assembled here: modes, sag, places of outputs"
     text = f"{whose} and what follows from them are those of the same scene on coarser cells, n_e = {result.coarser}."
+    if not result.built:
+        text += " Sizes with about are computed from that copy, to 1 % of the unknowns and 10 % of the non-zeros."
     copied = [text] if result.coarser else []
     no_modes = "" if periods else "Not computed: the factor would not fit."
     parts = [
