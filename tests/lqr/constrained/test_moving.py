@@ -93,7 +93,7 @@ def test_an_obstacle_that_keeps_coming_is_refused() -> None:
 
 def test_an_obstacle_that_passes_through_the_target_has_to_leave_room_there() -> None:
     plan = planned("paper_obstacle", *SMALL, CROSSING, online=True).plan
-    plant, low, high = plan.horizon.plant, *(getattr(plan.task.places, end)(axis=0) for end in ("min", "max"))
+    plant, low, high = plan.horizon.plant, plan.task.places.min(axis=0), plan.task.places.max(axis=0)
     ball = Ball(np.array([low[0] / 2 + high[0] / 2, high[1] + 20.0]), 0.5)
     task = replace(plan.task, shapes=(ball,), names=("ball",), paths=(Uniform(np.array([0.0, -0.5])),))
     gone = (20.0 + 2.0 + 0.5) / 0.5  # its top is below the body, of height 2 m, from then on [s]
