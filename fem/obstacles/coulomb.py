@@ -6,7 +6,7 @@ y_t half the slip of the step; a node has one tangent in 2D and two in 3D. Newto
 slip [AC91]: in 2D it is exact when the sets stay, in 3D the directions of slipping nodes converge with it. Its factor
 stays while few rows of the matrix are others: those are taken in by a small matrix of their own. Where the method comes
 back to sets seen before, sweeps of Gauss-Seidel over the nodes find others; then pivots do (`lemke.py`), which in 2D
-always end at a solution, or friction that grows. `friction.c` does so; without a compiler
+end at a solution but for rounding, or friction that grows. `friction.c` does so; without a compiler
 NumPy takes the same rounds, each with a factor of its own.
 """
 

@@ -4,7 +4,8 @@ With m directions d_j of the tangents that span them with positive shares, x_t =
 
     0 <= x_n,  y_n >= 0;   0 <= b_j,  d_j'y_t + l >= 0;   0 <= l,  mu x_n - sum_j b_j >= 0,   each pair complementary.
 
-For W positive definite the method ends at a solution for every mu [AP97]. In 2D, d = +-1, that is Coulomb's law
+For W positive definite the method ends at a solution for every mu [AP97], but for rounding, seen with mu of 1000 and
+more; where a node touches two obstacles W is singular, and there may be none. In 2D, d = +-1, that is Coulomb's law
 itself; in 3D the cone is a pyramid, and its solution a start for Newton's method.
 """
 
@@ -60,7 +61,7 @@ def pyramid_forces(W: Array, q: Array, mu: Array, tangents: int) -> Array | None
 
 
 def lemke(M: Array, q: Array, cover: Array) -> Array | None:
-    """Z (n,) with z >= 0, M z + q >= 0, z'(M z + q) = 0; None on a ray, or after too many pivots.
+    """Z (n,) with z >= 0, M z + q >= 0, z'(M z + q) = 0; None on a ray, by rounding, or after too many pivots.
 
     Complementary pivots with a covering vector > 0, (n,).
     """
@@ -85,7 +86,10 @@ def lemke(M: Array, q: Array, cover: Array) -> Array | None:
             return z[n:]
         entering = leaving + n if leaving < n else leaving - n
         if count % ANEW == 0:
-            T = np.linalg.solve(first[:, basis], first)
+            try:
+                T = np.linalg.solve(first[:, basis], first)
+            except np.linalg.LinAlgError:  # rounding chose a pivot that is none
+                return None
         row = _ratio(T, entering, basis == 2 * n)
         if row < 0:
             return None
