@@ -65,8 +65,8 @@ class Obstacle(Section):
     parts: Annotated[int, Field(ge=1, le=64)] | None = Field(
         None,
         description="parts of a boundary edge between points that can touch, 1: nodes alone [1]; with "
-        "effects.obstacles; default: nodes, and more where the obstacle is smaller than their distance or, in 3D, on "
-        "order 2",
+        "effects.obstacles; the largest counts for all obstacles; default: nodes, and more where the obstacle is "
+        "smaller than their distance or, in 3D, on order 2",
     )
     path: Dropped[Path] = Field(None, description="translation over time {velocity [m/s] or csv}; fixed unless given")
 

@@ -91,6 +91,20 @@ def test_in_two_dimensions_pivots_find_forces_for_any_friction(
     assert refused <= 1  # by rounding: 0 of 480 seen with the kernels of two kinds of processors
 
 
+def test_a_basis_that_rounding_made_singular_ends_the_pivots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As it was seen with mu of 1000 and more; NumPy's own error would end the run without a sentence."""
+    A = np.random.default_rng(0).standard_normal((24, 24))
+    problem = A.T @ A + 0.1 * np.eye(24), -np.ones(24), np.full(12, 10.0), 1
+    assert pyramid_forces(*problem) is not None
+
+    def singular(*_: object) -> None:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr("softgrasp.fem.obstacles.lemke.ANEW", 1)
+    monkeypatch.setattr(np.linalg, "solve", singular)
+    assert pyramid_forces(*problem) is None
+
+
 def test_a_large_problem_is_left_to_friction_that_grows() -> None:
     k = 400
     assert pyramid_forces(np.eye(2 * k), np.ones(2 * k), np.ones(k), 1) is None
@@ -289,6 +303,9 @@ def test_friction_in_three_dimensions_closes_the_balance(obstacle: str) -> None:
 REFUSED = [
     ("paper_obstacle", ["obstacle=[{kind='disc', center=[9, 9], radius=0.1, friction=0.2}]"],
      "which only effects.obstacles = true uses"),
+    ("set_down", ["obstacle=[{kind='halfspace', normal=[0, 1], offset=-0.05, friction=0.2},"
+                  "{kind='disc', center=[9, 9], radius=0.1, parts=4}]"],
+     "obstacle.1.parts cannot go with the friction of another obstacle"),
     ("paper_forward", [*SMALL, table(-1.0)], "friction"),
 ]  # fmt: skip
 
