@@ -132,7 +132,8 @@ class ClosedLoop:
         solver: cholesky, mumps, cg, stars or auto.
         rtol: relative residual at which cg or stars ends a step [1]; None for 1e-8 with cg, 1e-4 with stars.
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
-        scene: model with the obstacles that the tissue meets in runs with ``touching``; None for none.
+        scene: model of the same mesh and hand with ``effects.obstacles``, which the tissue meets in runs with
+            ``touching``; None for none.
 
     Raises:
         ControlError: dt is not a positive number.

@@ -111,12 +111,20 @@ def touching_drive(scene: Model | None, drive: GainDrive, steps: int) -> Touchin
     """The drive of a loop whose tissue meets the obstacles of a scene. Collective.
 
     Raises:
-        ControlError: the loop was made without a scene, or its plant has finite strain.
+        ControlError: the loop was made without a scene or with one of another size or without contact, or its plant has
+            finite strain.
         SceneError: a path of an obstacle does not fit.
     """
     if scene is None:
         raise ControlError("the loop has no obstacles; make it with ClosedLoop(..., scene=model)")
-    plant = drive.plant
+    plant, mine, its = drive.plant, scene.system.layout, drive.plant.system.layout
+    if not scene.scene.effects.obstacles:
+        raise ControlError("the model of ClosedLoop(..., scene=model) has effects.obstacles = false; set it to true")
+    if (mine.n_e, mine.n_s) != (its.n_e, its.n_s):
+        raise ControlError(
+            f"the model of ClosedLoop(..., scene=model) has {mine.n_e} unknowns and {mine.n_s} of the hand, the plant "
+            f"{its.n_e} and {its.n_s}; give the model of the same mesh and hand"
+        )
     if plant.system.points is not None:
         raise ControlError("a loop at finite strain cannot meet obstacles yet; set one of the two effects to false")
     hand = plant if plant.system.two_way else None

@@ -123,6 +123,21 @@ def test_a_loop_without_obstacles_cannot_meet_them() -> None:
     loop.destroy()
 
 
+OTHERS = [
+    (["tissue.cells=[2, 6]", *FLOOR], "give the model of the same mesh and hand"),
+    (["tissue.cells=[2, 4]"], "has effects.obstacles = false"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "words"), OTHERS)
+def test_a_scene_that_does_not_fit_the_loop_is_refused(overrides: list[str], words: str) -> None:
+    found = sg.design(sg.build("paper_lqr", ["tissue.cells=[2, 4]"]))
+    loop = sg.ClosedLoop(found.problem, 0.1, scene=sg.build("paper_lqr", overrides))
+    with pytest.raises(ControlError, match=words):
+        loop.run(found.gain, found.target, 2, options=LoopOptions(touching=True))
+    loop.destroy()
+
+
 @pytest.mark.serial
 def test_rounds_that_do_not_end_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("softgrasp.lqr.loop.touching.MOST", 1)
