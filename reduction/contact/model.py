@@ -59,9 +59,11 @@ class ContactRun(Shown):
         """Steps and forces."""
         steps = len(self.times) - 1
         force = float(np.linalg.norm(self.force, axis=2).max(initial=0.0))
+        least = float(self.gap.min())
         rows = (
             ("time", f"{counted(steps, 'step')} to {amount(self.times[-1], 's')}"),
             ("force", f"at most {amount(force, 'N')}"),
+            ("gap", f"at least {amount(least, 'm')} at nodes"),
         )
         return Card("Run of a reduced model with contact", rows)
 

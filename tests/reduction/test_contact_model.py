@@ -84,6 +84,8 @@ def test_hats_at_every_node_are_the_rows_of_nodes() -> None:
     assert np.abs(one.outputs - other.outputs).max() < 1e-9  # the same span, of a path of 0.5 m
     assert np.abs(one.force - other.force).max() < 1e-6 * one.force.max()
     assert np.linalg.norm(coarse.force - one.force) < 5e-2 * np.linalg.norm(one.force)
+    assert coarse.gap.min() < 0  # of nodes; mean gaps are not
+    assert f"at least {coarse.gap.min():.3g} m at nodes" in str(coarse)
     with pytest.raises(ModelError, match=r"rows = 1; it must be at least 2"):
         contact_model(model, 8, rows=1)
 
