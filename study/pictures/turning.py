@@ -60,7 +60,7 @@ class Scene3D:
             "near": 0.6 * float(np.linalg.norm(np.ptp(points, axis=1), axis=1).max()),
             "yaw": -np.pi / 2 if self.flat else np.radians(shapes.AZIMUTH),
             "pitch": np.pi / 2 if self.flat else np.radians(shapes.ELEVATION),
-            "times": times, "labels": [self.labels[i].replace("\n", ", ") for i in kept],
+            "times": times, "labels": [self.labels[i].replace("\n", " ") for i in kept],
             "slower": 1 / shapes.speed_up(np.array(times)) if times[-1] > times[0] else 1.0,
         }  # fmt: skip
         page = Environment(autoescape=True, trim_blocks=True, undefined=StrictUndefined).from_string(

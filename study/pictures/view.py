@@ -110,7 +110,8 @@ class Move:
         """Time and place of the hand."""
         hand = np.asarray(self._read(i).field_data["hand"])
         d = 2 if self.flat else 3
-        return f"{self.times[i]:.3g} s\nhand at ({', '.join(f'{x:.3g}' for x in hand[:d])}) m"
+        x = np.where(np.abs(hand[:d]) < 1e-3 * np.abs(hand[:d]).max(), 0.0, hand[:d])  # rounding has many digits
+        return f"{self.times[i]:.3g} s, hand at\n({', '.join(f'{v:.3g}' for v in x)}) m"
 
     def _read(self, i: int) -> Any:
         _, file, checks = self._instants[i]
@@ -164,7 +165,9 @@ def view(folder: Path, field: str, save: Path | None) -> None:
         raise SceneError("there is no display here for a window; give --save move.png")
     import pyvista
 
-    bar = {"title": f"{move.title}\n", "color": "black", "n_labels": 3, "fmt": "%.3g"}
+    bar: dict[str, Any] = {"title": f"{move.title}\n", "color": "black", "n_labels": 3, "fmt": "%.3g"}
+    if save is not None:
+        bar |= {"position_x": 0.15, "width": 0.65}  # of a quarter of the picture
     look = {
         "scalars": "value", "clim": move.range, "cmap": "viridis", "ambient": 0.4, "show_edges": True,
         "edge_opacity": 0.2, "scalar_bar_args": bar,

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -42,9 +43,19 @@ def test_parts_of_a_run_join_in_time(two_legs: Path) -> None:
     assert sorted(path.name for path in two_legs.glob("*.pvd")) == ["fields-from12.pvd", "fields.pvd"]
     assert move.times == pytest.approx([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0])
     assert move.title == "von_mises [Pa]"
-    assert move.label(6) == "3 s\nhand at (5, 3) m"
+    assert move.label(6) == "3 s, hand at\n(5, 3) m"
+    assert move.label(0) == "0 s, hand at\n(0, 0) m"
     end = move.body(6)
     assert end.center[:2] == pytest.approx([5.5, 4.0], abs=0.1)  # the body's middle and the target
+
+
+@needs_pyvista
+def test_a_title_leaves_out_what_rounding_moves(two_legs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four titles of three long numbers each would not be seen whole."""
+    move = Move(two_legs, "von_mises")
+    move.flat = False
+    monkeypatch.setattr(Move, "_read", lambda *_: SimpleNamespace(field_data={"hand": [-7.25e-7, 2e-5, -0.0115]}))
+    assert move.label(6) == "3 s, hand at\n(0, 2e-05, -0.0115) m"
 
 
 @needs_pyvista
