@@ -130,6 +130,12 @@ def check_obstacles(obstacles: list[Obstacle] | None, used: bool) -> None:
     for i, name in enumerate(names):
         if name in names[:i]:
             raise ValueError(f"obstacle.{names.index(name)} and obstacle.{i} are both named {name}; name one anew")
+    divided = [i for i, obstacle in enumerate(obstacles) if obstacle.parts is not None]
+    if divided and any(obstacle.friction for obstacle in obstacles):
+        raise ValueError(
+            f"obstacle.{divided[0]}.parts cannot go with the friction of another obstacle, which lets nodes alone "
+            "touch; drop one of them"
+        )
 
 
 def obstacle_names(obstacles: list[Obstacle]) -> list[str]:

@@ -323,12 +323,6 @@ def _check_contact(scene: Scene) -> None:
         raise ValueError(
             "tissue.refine.tolerance cannot go with effects.obstacles, which its estimate does not include; drop it"
         )
-    divided = [i for i, obstacle in enumerate(scene.obstacle) if obstacle.parts is not None]
-    if divided and any(obstacle.friction for obstacle in scene.obstacle):
-        raise ValueError(
-            f"obstacle.{divided[0]}.parts cannot go with the friction of another obstacle, which lets nodes alone "
-            "touch; drop one of them"
-        )
     if scene.effects.finite_strain is not None:
         _check_finite(scene, scene.obstacle)
     if scene.time.solver in ("cg", "stars"):
