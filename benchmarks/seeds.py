@@ -53,10 +53,10 @@ CASES = {
     ),
     "3D": Case(
         "block_3d",
-        ("control.outputs=[{kind='node', point=[0.025, 0.025, 0.0], name='tip'}]", "tissue.order=2",
-         "tissue.cells=[6, 4, 10]", "time.steps=100"),
-        ("tissue.order=3", "tissue.cells=[8, 6, 14]", "time.steps=400"),
-        {"mu": 1.3}, 3e-4, 4,
+        ("control.outputs=[{kind='node', point=[0.025, 0.025, 0.0], name='tip'}]", "tissue.cells=[4, 3, 6]",
+         "motion.duration=0.2", "time.end=0.5", "time.steps=100"),
+        ("tissue.cells=[6, 4, 10]", "time.steps=400"),
+        {"mu": 1.3, "beta": 1.4}, 3e-3, 8,
     ),
 }  # fmt: skip
 COLUMNS = {
