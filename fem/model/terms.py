@@ -195,7 +195,7 @@ def _positive(A: PETSc.Mat, shift: float = 0.0) -> bool:
         X.shift(shift)
     X.setOption(PETSc.Mat.Option.SPD, False)
     X.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-    pc.setOptionsPrefix("softgrasp_inertia_")
+    pc.setOptionsPrefix("inertia_")  # none of the user's: the answer must not depend on them
     pc.setType("cholesky")
     pc.setFactorSolverType("mumps")
     pc.setOperators(X)

@@ -80,6 +80,11 @@ class MujocoTissue:
                 f"body '{body}' weighs {mass:.4g} kg with what it carries, and its tissue {system.rigid[0, 0]:.4g} kg; "
                 "add the body of `softgrasp export MODEL --mujoco FILE`"
             )
+        if mj_model.body_simple[self.body]:
+            raise ModelError(
+                f"MuJoCo keeps the diagonal alone of the mass matrix of body '{body}', and the tissue needs all of it; "
+                "put the tissue's mass in a body fixed to it, as `softgrasp export MODEL --mujoco FILE` does"
+            )
         small, k, nv = system.small, rom.k, mj_model.nv
         self.dt, self.rom, self.small = dt, rom, small
         self.inverse = np.linalg.inv(small.M + dt / 2 * small.D + dt * dt / 4 * small.K)
@@ -164,7 +169,8 @@ class MujocoTissue:
         inertia[3:, :3] += lever
         inertia[3:, 3:] += whole.trace() * EYE - whole
         force = pulled @ right
-        V = square @ whole + W @ (2 * (sums[3:, 1] + C[:, 1])).reshape(3, 3)
+        moving = sums[3:, 1].reshape(3, 3) + C[:, 1].reshape(3, 3).T  # int rho e_k (r + z)_l
+        V = square @ whole + W @ (2 * moving)
         force[:3] += square @ m + W @ (2 * sums[:3, 1])
         force[3:] -= lever @ g
         (_, xy, xz), (yx, _, yz), (zx, zy, _) = V.tolist()

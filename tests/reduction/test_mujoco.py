@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -169,3 +170,56 @@ def test_what_does_not_fit_is_refused(rom: TurningModel) -> None:
         MujocoTissue(rom, world('<body name="hand"><freejoint/><geom size=".01" mass=".001"/></body>', 1e-3))
     with pytest.raises(ModelError, match="small angles"):
         MujocoTissue(reduced({"damping": False}, 12, turns=False), model)
+
+
+def test_loads_of_a_spin_are_those_of_point_masses() -> None:
+    """What acts on modes and body at a deformation and its velocity, against sums over nine masses."""
+    rng, h, k = np.random.default_rng(0), 1e-3, 5
+    mass, r, phi = rng.uniform(0.5, 1, 9), rng.normal(size=(9, 3)), rng.normal(size=(k, 9, 3))
+    axes = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1)  # axes[c] y = e_c x y
+    E, S = np.einsum("n,ink,jnl->klij", mass, phi, phi), np.einsum("n,ink,nl->ikl", mass, phi, r).reshape(k, 9)
+    G = np.hstack([np.einsum("n,ink->ik", mass, phi), np.einsum("n,ink,ckl,nl->ic", mass, phi, axes, r)])
+    M, K, D = np.trace(E), 7 * np.eye(k), 0.3 * np.eye(k)
+    sums = np.hstack([G[:, :3], S])
+    tissue: Any = SimpleNamespace(
+        dt=h, a=rng.normal(size=k), e=rng.normal(size=k), _past=np.zeros(k), _rate=np.zeros(3),
+        small=SimpleNamespace(M=M, K=K, D=D, G=G, S=S, E=E), inverse=np.linalg.inv(M + h / 2 * D + h * h / 4 * K),
+        _integrals=np.vstack([E.reshape(9 * k, k), sums.T]), _loads=sums, _forces=np.hstack([K, D + h / 2 * K]),
+        _turns=np.vstack([np.zeros((2, 9)), axes.reshape(3, 9)]),
+    )  # fmt: skip
+    w, g = rng.normal(size=3), rng.normal(size=3)
+    inertia, force, right, pulled = MujocoTissue._known(tissue, w, g)
+
+    z, rate = (np.einsum("i,ink->nk", x, phi) for x in (tissue.a + h / 2 * tissue.e, tissue.e))
+    place = r + z
+
+    def travel(places: Array, rates: Array) -> Array:
+        """Acceleration in the axes of the body that a spin gives to points."""
+        return np.cross(w, np.cross(w, places)) + 2 * np.cross(w, rates)
+
+    def rigid(places: Array) -> Array:
+        """Mass matrix (6, 6) of the masses fixed to the body."""
+        turns = np.einsum("ckl,nl->nkc", axes, places)
+        rows = np.concatenate([np.broadcast_to(np.eye(3), (9, 3, 3)), turns], axis=2)
+        return np.einsum("n,nki,nkj->ij", mass, rows, rows)
+
+    G_a = np.hstack([G[:, :3], np.einsum("n,ink,ckl,nl->ic", mass, phi, axes, place)])
+    r_a = np.einsum("n,ink,nk->i", mass, phi, g - travel(place, rate)) - K @ tissue.a - (D + h / 2 * K) @ tissue.e
+    f, f_rigid = travel(place, rate), travel(r, np.zeros((9, 3)))
+    v = np.concatenate([
+        mass @ (f - f_rigid),
+        mass @ (np.cross(place, f) - np.cross(r, f_rigid)) - np.cross(mass @ z, g),
+    ])  # fmt: skip
+    assert np.abs(pulled - G_a).max() < 1e-12  # rounding of sums of size 10
+    assert np.abs(right - r_a).max() < 1e-12
+    assert np.abs(inertia - (rigid(place) - rigid(r) - G_a.T @ tissue.inverse @ G_a)).max() < 1e-11
+    assert np.abs(force - (G_a.T @ tissue.inverse @ r_a + v)).max() < 1e-11
+
+
+def test_a_body_whose_mass_matrix_is_kept_as_a_diagonal_is_refused(rom: TurningModel) -> None:
+    """MuJoCo has no room for the coupling there."""
+    simple = f'<body name="hand">{SLIDES}<inertial pos="0 0 0" mass="5" diaginertia="0.02 0.02 0.02"/></body>'
+    model = world(simple, 1e-3)
+    assert model.body_simple[1]
+    with pytest.raises(ModelError, match="diagonal alone of the mass matrix of body 'hand'"):
+        MujocoTissue(rom, model, body="hand", dt=1e-3)
