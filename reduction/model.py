@@ -22,6 +22,26 @@ if TYPE_CHECKING:
     from softgrasp.fem.run.trajectory import Trajectory
 
 
+def check_materials(materials: tuple[LayerMaterial, ...], own: tuple[LayerMaterial, ...], damped: bool) -> None:
+    """Check that a model made with the materials ``own`` can represent others.
+
+    Raises ModelError: wrong number of layers, other own terms, no elastic material, or viscosity of a model that was
+    projected without damping.
+    """
+    if len(materials) != len(own):
+        raise ModelError(f"{len(materials)} materials are given; the model has {len(own)} layers")
+    if text := differs(materials, own):
+        raise ModelError(text)
+    for m in of_layers(materials):
+        if not (m.mu > 0 and m.lam > -2 * m.mu / 3 and m.rho > 0 and m.beta >= 0):
+            raise ModelError(
+                f"lambda = {m.lam:g} Pa, mu = {m.mu:g} Pa, rho = {m.rho:g} kg/m3, beta = {m.beta:g} s is no "
+                "elastic material; mu and rho must be > 0, lambda > -2 mu / 3 and beta >= 0"
+            )
+    if not damped and any(m.beta > 0 for m in materials):
+        raise ModelError("beta > 0 needs a model projected with effects.damping; name it in the scene")
+
+
 @dataclass(frozen=True, repr=False)
 class ReducedModel(Shown):
     """E x' = A x + B u + F g for all lambda, mu, rho of every layer: a new parameter needs no full-order work.
@@ -127,18 +147,7 @@ class ReducedModel(Shown):
             ModelError: wrong number of layers, an impossible value, densities that are no common multiple of those of
                 the projection (canonical models), or viscosity in a model without damping.
         """
-        if len(materials) != len(self.materials):
-            raise ModelError(f"{len(materials)} materials are given; the model has {len(self.materials)} layers")
-        if text := differs(materials, self.materials):
-            raise ModelError(text)
-        for m in of_layers(materials):
-            if not (m.mu > 0 and m.lam > -2 * m.mu / 3 and m.rho > 0 and m.beta >= 0):
-                raise ModelError(
-                    f"lambda = {m.lam:g} Pa, mu = {m.mu:g} Pa, rho = {m.rho:g} kg/m3, beta = {m.beta:g} s is no "
-                    "elastic material; mu and rho must be > 0, lambda > -2 mu / 3 and beta >= 0"
-                )
-        if not self.damped and any(m.beta > 0 for m in materials):
-            raise ModelError("beta > 0 needs a model projected with effects.damping; name it in the scene")
+        check_materials(materials, self.materials, self.damped)
         scale = 1.0
         if self.coordinates == "qp":
             pairs = [(m.dense, old.dense) for m, old in zip(materials, self.materials, strict=True)]

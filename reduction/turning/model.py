@@ -21,9 +21,10 @@ from softgrasp.fem.frame.integrals import in_space
 from softgrasp.fem.frame.path import LARGEST_TURN, PathSteps, mean_wrench, world_outputs
 from softgrasp.fem.frame.rotation import freedoms, rotation_matrix, spatial
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.material import LayerMaterial, differs, in_words, of_layers
+from softgrasp.fem.material import LayerMaterial, in_words
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.shown import Card, Shown, amount, counted, listed
+from softgrasp.reduction.model import check_materials
 from softgrasp.reduction.online import ReducedTrajectory, checked_hand
 from softgrasp.reduction.operators import Parameters, Parts
 from softgrasp.reduction.system import ModelError, Outputs
@@ -274,18 +275,7 @@ class TurningModel(Shown):
         if not (np.isfinite(dt) and dt > 0):
             raise ModelError(f"dt = {dt:g} s must be a positive number")
         materials = self.materials if materials is None else materials
-        if len(materials) != len(self.materials):
-            raise ModelError(f"{len(materials)} materials are given; the model has {len(self.materials)} layers")
-        if text := differs(materials, self.materials):
-            raise ModelError(text)
-        for m in of_layers(materials):
-            if not (m.mu > 0 and m.lam > -2 * m.mu / 3 and m.rho > 0 and m.beta >= 0):
-                raise ModelError(
-                    f"lambda = {m.lam:g} Pa, mu = {m.mu:g} Pa, rho = {m.rho:g} kg/m3, beta = {m.beta:g} s is no "
-                    "elastic material; mu and rho must be > 0, lambda > -2 mu / 3 and beta >= 0"
-                )
-        if not self.damped and any(m.beta > 0 for m in materials):
-            raise ModelError("beta > 0 needs a model projected with effects.damping; name it in the scene")
+        check_materials(materials, self.materials, self.damped)
         p, parts = Parameters(materials), self.parts
         E = p.density(parts["E"])
         M = np.trace(E)
