@@ -122,7 +122,7 @@ def term_blocks(
     """
     comm, found, materials = space.layout.comm, list[LayerBlocks](), list[LayerMaterial]()
     scene._terms = tuple(map(copy, scene._terms))  # with digests on this mesh; another model has the same terms too
-    beta = 0.0 if scene.effects.damping is None else rows[-1].beta
+    beta = 0.0 if scene.effects.damping is None else scene.effects.damping.beta
     nothing: Component | None = None
     for term in scene._terms:
         u, v = ufl.TrialFunction(space.V), ufl.TestFunction(space.V)

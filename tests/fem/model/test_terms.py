@@ -48,6 +48,24 @@ def test_a_term_adds_its_matrix_and_follows_its_parameter(order):
     assert beta == plain.system.damping.beta > 0  # Kelvin-Voigt damping includes the term, without a matrix
 
 
+def test_springs_of_a_layered_body_have_the_damping_that_no_layer_overrides():
+    whole = {"low": {"box": [[0, 0], [1, 1]], "beta": 0.03}, "high": {"box": [[0, 1], [1, 2]], "beta": 0.05}}
+    tissue = {
+        "cells": [4, 8],
+        "layers": {k: {**v, "material": {"mu": 30.0, "lambda": 30.0, "rho": 1.0}} for k, v in whole.items()},
+    }
+    plain = sg.build("paper_lqr", tissue=tissue).system
+    own = sg.build("paper_lqr", tissue=tissue, terms=[sg.Term("bed", on_boundary, 30.0)]).system
+    X = np.random.default_rng(1).standard_normal((plain.layout.n_local, 2))
+
+    def more(matrix):
+        return times_columns(matrix(own), X) - times_columns(matrix(plain), X)
+
+    springs = more(lambda system: system.K_ee)
+    lost = more(lambda system: system.damping.matrix)  # the scene's beta is 0.002 s
+    assert np.abs(lost - 0.002 * springs).max() < 1e-12 * np.abs(springs).max()  # differences of sums of few entries
+
+
 @pytest.mark.ranks
 def test_reduced_models_and_feedback_know_the_parameter():
     model = sg.build("paper_lqr", KEYS, terms=[sg.Term("bed", on_boundary, 30.0)])
