@@ -68,6 +68,7 @@ pictures: demo ## make the README's pictures again
 	$(BIN)/softgrasp effects franka_muscle
 	cp out/franka_muscle-effects/effects.png docs/effects.png
 	$(BIN)/python tools/draw_rooms.py docs/rooms.png
+	cd docs && ../$(BIN)/python ../demos/demo_arm.py
 	$(BIN)/python tools/draw_finite_strain.py docs/finite_strain.png
 
 docs: $(STAMP) ## build the documentation into out/site, with all links checked

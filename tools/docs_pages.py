@@ -30,6 +30,7 @@ ORDER = (
     "certified",
     "control",
     "effects",
+    "arm",
     "ranks",
 )  # of the gallery
 OWN_BASIS = "static_responses.py"
