@@ -1,128 +1,8 @@
-/* 0 <= x, W x + q >= 0, x'(W x + q) = 0 for a symmetric W >= 0 by block principal pivoting [JP94]: all rows of a wrong
-   sign change sides at once; after RETRIES rounds that leave as many of them, the last one alone, which is finite. The
-   Cholesky factor of W_AA (1 + RIDGE on the diagonal, so that equal rows share their force) follows the set A by rows.
-   Below it, the step before half-spaces: gaps of all boundary nodes, forces of those that ever touched, what they do. */
-#include "dense.h"
+/* The step before half-spaces: gaps of all boundary nodes, forces of those that ever touched, what they do, and the impulse
+   at its end. The small problem is that of pivots.h. */
+#include "flat.h"
 
-/* One more row of the factor; 0 where its pivot is not positive. */
-static int append(int ld, const double *W, int *m, int *order, double *L, int row) {
-  double *l = L + (size_t)*m * ld;
-  const double *w = W + (size_t)row * ld;
-  for (int k = 0; k < *m; k++) l[k] = (w[order[k]] - dot(k, L + (size_t)k * ld, l)) / L[(size_t)k * ld + k];
-  double pivot = w[row] * (1 + RIDGE) - dot(*m, l, l);
-  if (!(pivot > 0)) return 0;
-  l[*m] = sqrt(pivot);
-  order[(*m)++] = row;
-  return 1;
-}
-
-/* The factor without its k-th row: the rest takes up the column that goes, by rotations. */
-static void leave(int ld, int *m, int *order, double *L, int k, double *c, double *s) {
-  int last = *m - 1;
-  for (int i = k; i < last; i++) {
-    double *to = L + (size_t)i * ld;
-    const double *from = to + ld;
-    double x = from[k];
-    order[i] = order[i + 1];
-    memcpy(to, from, k * sizeof(double));
-    memcpy(to + k, from + k + 1, (i - k + 1) * sizeof(double));
-    for (int j = k; j < i; j++) {
-      double y = to[j];
-      to[j] = c[j] * y + s[j] * x;
-      x = c[j] * x - s[j] * y;
-    }
-    double r = hypot(to[i], x);
-    c[i] = to[i] / r;
-    s[i] = x / r;
-    to[i] = r;
-  }
-  *m = last;
-}
-
-static void solve(int ld, int m, const double *L, double *y) {
-  for (int i = 0; i < m; i++) y[i] = (y[i] - dot(i, L + (size_t)i * ld, y)) / L[(size_t)i * ld + i];
-  for (int i = m - 1; i >= 0; i--) {
-    const double *l = L + (size_t)i * ld, t = y[i] /= l[i];
-    for (int k = 0; k < i; k++) y[k] -= l[k] * t;
-  }
-}
-
-/* Row numbers and factor of A come in and go out by count, order and L; W and L have ld columns. Room: 5 ld numbers. Adds
-   rounds and changes of the set to tally. Returns 0, -1 after `most` rounds, -2 where a pivot is not positive. */
-int softgrasp_complement(int p, int ld, const double *W, const double *q, double tol, int most, int *count, int *order,
-                         double *L, double *x, int *side, double *room, long *tally) {
-  double *y = room, *c = room + ld, *s = room + 2 * ld, *full = room + 3 * ld;
-  int m = *count, best = p + 1, tries = RETRIES;
-  for (int round = 0; round < most; round++) {
-    tally[0]++;
-    memset(side, 0, p * sizeof(int));
-    memset(full, 0, p * sizeof(double));
-    for (int i = 0; i < m; i++) {
-      y[i] = -q[order[i]];
-      side[order[i]] = 1;
-    }
-    solve(ld, m, L, y);
-    for (int i = 0; i < m; i++) full[order[i]] = y[i];
-    int wrong = 0, last = -1;
-    for (int i = 0; i < p; i++)
-      if (side[i] ? full[i] < 0 : q[i] + dot(p, W + (size_t)i * ld, full) < -tol) {
-        side[i] |= 2;
-        wrong++;
-        last = i;
-      }
-    if (!wrong) {
-      memcpy(x, full, p * sizeof(double));
-      *count = m;
-      return 0;
-    }
-    if (wrong < best) {
-      best = wrong;
-      tries = RETRIES;
-    } else if (tries > 0) {
-      tries--;
-    } else {
-      for (int i = 0; i < last; i++) side[i] &= 1;
-      wrong = 1;
-    }
-    tally[1] += wrong;
-    if (wrong > m / 3 + 4) { /* a new factor is cheaper */
-      m = 0;
-      for (int i = 0; i < p; i++)
-        if ((side[i] == 1 || side[i] == 2) && !append(ld, W, &m, order, L, i)) return *count = 0, -2;
-      continue;
-    }
-    for (int i = m - 1; i >= 0; i--)
-      if (side[order[i]] == 3) leave(ld, &m, order, L, i, c, s);
-    for (int i = 0; i < p; i++)
-      if (side[i] == 2 && !append(ld, W, &m, order, L, i)) return *count = 0, -2;
-  }
-  *count = 0;
-  return -1;
-}
-
-typedef struct {
-  int p, d, n_s, obstacles; /* boundary nodes, axes, freedoms of the hand, half-spaces */
-  int m;                    /* tangents with friction */
-  int n, whole, k;          /* rows here of the step, whether they are all rows, contact rows */
-  const double *X, *T;      /* places at rest (p, d), modes of the hand (p d, n_s) */
-  const double *along;      /* normals of the half-spaces, each before its tangents (obstacles, 1 + m, d) */
-  const int *at;            /* row here of each unknown of the boundary, -1 where another rank has it (p d) */
-  double *w, *r;            /* half the change of z in the step, and its right-hand side (n) */
-  double *z, *moved, *v;    /* displacement, its half change and velocity of the boundary (p d) */
-  double *q, *qdot;         /* hand at the end of the step and its velocity there (n_s) */
-  const double *q0, *slide; /* hand at the start of it (n_s), way of the half-spaces in it (obstacles, d) */
-  double *level, *rate;     /* n.x of the half-spaces at the end of the step (obstacles), velocities (obstacles, d) */
-  double *gap, *after;      /* gaps before and at the end of the step (obstacles, p) */
-  char *entered;            /* whether a pair has a row (obstacles, p) */
-  double *least;            /* least gaps at the end (obstacles) */
-  const int *row;           /* obstacle, node, column and direction of each contact row, 0 for the normal (k, 4) */
-  const int *kind;          /* sets of the pairs, see friction.c; 0 without friction */
-  const double *columns;    /* S^-1 N' on the rows here, a column after the other (.., n) */
-  double *free, *x, *b;     /* right-hand side of the small problem, forces, velocities to stop (k) */
-  double *change;           /* what the last `softgrasp_apply` added to the force of each column */
-  double *force, *touching, *hand, *gaps; /* tables of the run, see Tables */
-  double *energy;           /* work, energy dissipated at first touch, by impulses, by friction (4) */
-} Flat;
+#include "pivots.h"
 
 static const double *along(const Flat *f, const int *row) {
   return f->along + (size_t)(row[0] * (1 + f->m) + row[3]) * f->d;
@@ -169,13 +49,13 @@ static double value(const Flat *f, int j) {
 }
 
 /* Pairs without a row that end deeper than tol; the largest gap of pressed rows into `reached`. */
-int softgrasp_missing(const Flat *f, double tol, double *reached) {
-  int missing = 0;
-  for (int i = 0; i < f->obstacles * f->p; i++) missing += f->after[i] < -tol && !f->entered[i];
+static int missing(const Flat *f, double tol, double *reached) {
+  int count = 0;
+  for (int i = 0; i < f->obstacles * f->p; i++) count += f->after[i] < -tol && !f->entered[i];
   *reached = 0;
   for (int j = 0; j < f->k; j += 1 + f->m)
     if (f->x[j] > 0) *reached = fmax(*reached, fabs(f->after[(size_t)f->row[4 * j] * f->p + f->row[4 * j + 1]]));
-  return missing;
+  return count;
 }
 
 /* Half gaps and slips of the rows at the end of the step that is in w. */
@@ -183,8 +63,14 @@ void softgrasp_values(const Flat *f, double *to) {
   for (int j = 0; j < f->k; j++) to[j] = value(f, j);
 }
 
+/* Half gaps and slips of the rows without their forces, from those with them. */
+void softgrasp_refresh(const Flat *f) {
+  softgrasp_values(f, f->free);
+  for (int j = 0; j < f->k; j++) f->free[j] -= dot(f->k, f->W + (size_t)j * f->ld, f->x);
+}
+
 /* Right-hand side of the small problem from the end of a step without forces. */
-void softgrasp_begin(const Flat *f) {
+static void begin(const Flat *f) {
   softgrasp_values(f, f->free);
   memset(f->x, 0, f->k * sizeof(double));
 }
@@ -198,7 +84,8 @@ static void add_to_r(const Flat *f, int j, double t) {
 }
 
 /* Take forces x instead of those before into w and r, four columns in a pass. */
-void softgrasp_apply(const Flat *f, int columns, const double *x) {
+static void apply(const Flat *f, const double *x) {
+  const int columns = f->count_columns;
   const double *c[4];
   double t[4];
   int m = 0;
@@ -225,7 +112,7 @@ void softgrasp_apply(const Flat *f, int columns, const double *x) {
 }
 
 /* Tables of step n: force and number of pressed nodes of each half-space, T'N'x, and energies. */
-void softgrasp_account(const Flat *f, int n) {
+static void account(const Flat *f, int n) {
   double *force = f->force + (size_t)n * f->obstacles * f->d, *touching = f->touching + (size_t)n * f->obstacles;
   double *hand = f->hand + (size_t)n * f->n_s;
   for (int j = 0; j < f->k; j++) {
@@ -244,32 +131,179 @@ void softgrasp_account(const Flat *f, int n) {
   }
 }
 
-/* Carry the boundary on to the end of step n; with `pressed`, r takes N'x once more, as it takes G c. */
-void softgrasp_carry(const Flat *f, int n, int pressed) {
+/* Carry the boundary on to the end of step n; r takes N'x once more, as it takes G c. */
+static void carry(const Flat *f, int n) {
   for (int u = 0; u < f->p * f->d; u++) f->z[u] += 2 * f->moved[u];
   memcpy(f->gap, f->after, sizeof(double) * f->obstacles * f->p);
   memcpy(f->gaps + (size_t)(n + 1) * f->obstacles, f->least, sizeof(double) * f->obstacles);
-  for (int j = 0; pressed && j < f->k; j++)
+  for (int j = 0; f->pressed && j < f->k; j++)
     if (f->x[j] != 0) add_to_r(f, j, f->x[j]);
 }
 
-/* Velocities b = -N v of the rows of pressed pairs, in their order; the largest along normals and the tangents of nodes
-   that stick, and the largest of any component. */
-double softgrasp_rates(const Flat *f, double *fastest) {
+
+/* Let a hand that feels the tissue feel the forces that the step has taken in. */
+static void push(const Flat *f, int n) {
+  double a[MODES] = {0}, b[MODES] = {0};
+  const int m = f->n_s;
+  for (int k = 0; k < f->count_columns; k++)
+    if (f->change[k] != 0)
+      for (int i = 0; i < m; i++) b[i] += f->B[(size_t)k * m + i] * f->change[k];
+  for (int i = 0; i < m; i++) a[i] = dot(m, f->inverse + i * m, b);
+  for (int i = 0; i < m; i++) {
+    const double c = f->kappa * a[i], *Y = f->Y + (size_t)i * f->n, *G = f->G + (size_t)i * f->n;
+    for (int u = 0; u < f->n; u++) f->w[u] -= Y[u] * c;
+    for (int u = 0; u < f->n; u++) f->r[u] -= G[u] * c;
+    f->cs[(size_t)n * m + i] -= c;
+    f->vs[(size_t)(n + 1) * m + i] += f->dt * a[i];
+    f->qs[(size_t)(n + 1) * m + i] += f->dt * f->dt / 2 * a[i];
+  }
+}
+
+/* The step n from where it is on: it says what it needs before it goes on from there, or that it is done. */
+int softgrasp_step(Flat *f, int n) {
+  double reached;
+  for (;;) switch (f->stage) {
+      case BEGIN:
+        f->q0 = f->qs + (size_t)n * f->n_s;
+        f->q = f->q0 + f->n_s;
+        f->stage = UNTOUCHED;
+        f->round = f->pressed = 0;
+        if (!f->whole) return TAKE;
+        break;
+      case UNTOUCHED:
+        f->tol = f->rounding * (softgrasp_look(f) + f->extent);
+        for (int o = 0; o < f->obstacles; o++) f->pressed |= f->least[o] < 0;
+        if (!f->pressed) return DONE;
+        begin(f);
+        f->stage = ROWS;
+        f->depth = 0;
+        if (missing(f, 0, &reached)) return ENTER;
+        break;
+      case ROWS:
+        f->stage = FORCES;
+        if (!f->compiled) return BALANCE;
+        if (softgrasp_complement(f->k, f->ld, f->W, f->free, f->tol / 4, f->most_each * f->k, f->count, f->order, f->L,
+                                 f->to, f->side, f->room, f->tally))
+          return UNSOLVED;
+        break;
+      case FORCES:
+        apply(f, f->to);
+        if (f->feels) push(f, n);
+        f->stage = AFTER;
+        if (!f->whole) return TAKE;
+        break;
+      default:
+        softgrasp_look(f);
+        f->stage = ROWS;
+        f->depth = f->tol;
+        const int more = missing(f, f->tol, &reached);
+        if (!more && reached <= f->tol) return account(f, n), DONE;
+        f->reached = reached;
+        if (++f->round == f->most) return UNSETTLED;
+        if (more) return ENTER;
+        softgrasp_refresh(f); /* what rounding left */
+    }
+}
+
+/* Carry step n on; whether rows are to stop that are pressed. v: velocities on the rows here, or 0: they are in f->v. */
+int softgrasp_finish(Flat *f, int n, const double *v) {
   double most = 0;
-  for (int j = 0, k = 0; j < f->k; j++) {
+  carry(f, n);
+  if (!f->pressed) return 0;
+  const double *qdot = f->vs + (size_t)(n + 1) * f->n_s;
+  for (int u = 0; v && u < f->p * f->d; u++) f->v[u] = v[f->rows[u]];
+  for (int j = 0; j < f->k; j++) {
     const int *row = f->row + 4 * j, o = row[0], i = row[1];
     if (!(f->x[j - row[3]] > 0)) continue;
     double b = 0;
     for (int a = 0; a < f->d; a++) {
-      int u = i * f->d + a;
-      double v = f->v[u] - f->rate[o * f->d + a];
-      for (int k = 0; k < f->n_s; k++) v += f->T[(size_t)u * f->n_s + k] * f->qdot[k];
-      *fastest = fmax(*fastest, fabs(v));
-      b -= along(f, row)[a] * v;
+      const int u = i * f->d + a;
+      double speed = f->v[u] - f->rate[o * f->d + a];
+      for (int k = 0; k < f->n_s; k++) speed += f->T[(size_t)u * f->n_s + k] * qdot[k];
+      f->fastest = fmax(f->fastest, fabs(speed));
+      b -= along(f, row)[a] * speed;
     }
-    f->b[k++] = b;
+    f->b[j] = b;
     if (row[3] == 0 || f->kind[j / (1 + f->m)] == 1) most = fmax(most, fabs(b));
   }
-  return most;
+  f->still = fmax(f->at_rest * f->fastest, f->s * f->tol);
+  return most > f->still;
+}
+
+/* Impulses y of the pressed rows at the end of step n: tables, velocities v on the rows here, momentum, hand. */
+void softgrasp_strike(const Flat *f, int n, double *v) {
+  const int d = f->d, m = f->n_s, own = f->feels;
+  double *impulse = f->impulse + (size_t)n * f->obstacles * d, *force = f->force + (size_t)n * f->obstacles * d;
+  double *kick = f->kick + (size_t)n * m, a[MODES] = {0}, b[MODES] = {0}, wrench[MODES] = {0}, work = 0;
+  for (int j = 0; j < f->k; j++) {
+    if (f->y[j] == 0) continue;
+    const int *row = f->row + 4 * j, o = row[0];
+    const double *e = along(f, row), *S = f->starts + (size_t)f->column[j] * d * m;
+    for (int i = 0; own && i < m; i++) b[i] += f->reach[(size_t)j * m + i] * f->y[j];
+    for (int c = 0; c < d; c++) {
+      const int u = row[1] * d + c;
+      const double y = f->y[j] * e[c];
+      impulse[o * d + c] += y;
+      force[o * d + c] += y / f->dt;
+      work += y * f->v[u];
+      for (int i = 0; i < m; i++) {
+        wrench[i] += f->T[(size_t)u * m + i] * y;
+        kick[i] += S[c * m + i] * y;
+      }
+    }
+    for (int i = 0; i < f->k; i++)
+      if (f->y[i] != 0) work += f->y[j] * f->A[(size_t)j * f->ld + i] * f->y[i] / 2;
+    add_to_r(f, j, f->s * f->y[j]);
+    const int to = f->ends[f->column[j] + 1];
+    for (int k = f->ends[f->column[j]]; k < to; k++)
+      for (int c = 0; c < d; c++) v[(size_t)f->reached_nodes[k] * d + c] += f->shares[k] * f->y[j] * e[c];
+  }
+  for (int i = 0; own && i < m; i++) {
+    a[i] = dot(m, f->H + i * m, b);
+    f->vs[(size_t)(n + 1) * m + i] += a[i];
+    const double *G = f->G + (size_t)i * f->n, *X = f->X_hand + (size_t)i * f->here;
+    for (int u = 0; u < f->n; u++) f->r[u] -= f->s * a[i] * G[u];
+    for (int u = 0; u < f->here; u++) v[u] -= X[u] * a[i];
+    work -= wrench[i] * a[i] / 2;
+  }
+  for (int i = 0; i < m; i++) {
+    if (own) kick[i] -= dot(m, f->GX + i * m, a);
+    f->hand[(size_t)n * m + i] += wrench[i] / f->dt;
+    if (own) work -= a[i] * (f->pulled[i] + kick[i] / 2);
+  }
+  f->energy[0] += work;
+}
+
+/* The inelastic impulse at the end of step n. Factor and set of pressed rows are kept. ENTER: rows lack their columns. */
+int softgrasp_stop(Flat *f, int n, double *v) {
+  int count = 0, same = 1;
+  double taken = 0, *b = f->room, *y = f->room + f->ld;
+  for (int j = 0; j < f->k; j++) {
+    if (!(f->x[j] > 0)) continue;
+    if (j >= f->struck) return ENTER;
+    f->side[count++] = j;
+  }
+  same = count == f->stopping;
+  for (int i = 0; same && i < count; i++) same = f->side[i] == f->stopped[i];
+  for (double ridge = RIDGE; !same; ridge *= 100) {
+    for (f->stopping = 0; f->stopping < count;)
+      if (!append(f->ld, f->A, &f->stopping, f->stopped, f->LA, f->side[f->stopping], ridge)) break;
+    same = f->stopping == count;
+  }
+  for (int i = 0; i < count; i++) y[i] = f->b[f->stopped[i]];
+  solve(f->ld, count, f->LA, y);
+  for (int i = 0; i < count; i++) { /* without the ridge's error */
+    const double *A = f->A + (size_t)f->stopped[i] * f->ld;
+    b[i] = f->b[f->stopped[i]];
+    for (int j = 0; j < count; j++) b[i] -= A[f->stopped[j]] * y[j];
+  }
+  solve(f->ld, count, f->LA, b);
+  memset(f->y, 0, f->k * sizeof(double));
+  for (int i = 0; i < count; i++) {
+    f->y[f->stopped[i]] = y[i] + b[i];
+    taken += (y[i] + b[i]) * f->b[f->stopped[i]] / 2;
+  }
+  f->energy[2] += taken;
+  softgrasp_strike(f, n, v);
+  return DONE;
 }

@@ -1,5 +1,6 @@
 /* What the compiled halves of contact share. RIDGE: share of the diagonal that makes equal rows share their force; it
    comes from Python, see compiled.py. */
+#pragma once
 #include <math.h>
 #include <stddef.h>
 #include <string.h>

@@ -36,8 +36,8 @@ class NodalMass:
 
     Attributes:
         nodes: node of every column.
-        columns: M^-1 e of every column on the rows here, (rows here, count) [1/kg].
-        block: the same at the nodes of the columns, (count, count) [1/kg].
+        kept: nodes here that M^-1 e of every column reaches, and its values there [1/kg].
+        block: values at the nodes of the columns, (count, count) [1/kg].
     """
 
     def __init__(self, M: csr_matrix, here: tuple[int, int], engine: str = "") -> None:
@@ -47,9 +47,9 @@ class NodalMass:
         self.code = None if engine == "NumPy" else compiled(SOURCE, DECLARATION)
         self.where = np.full(n, -1)
         self.nodes: Ints = np.zeros(0, dtype=np.intp)
-        self.columns: Any = np.zeros((here[1] - here[0], 0))
         self.block = np.zeros((0, 0))
         self.kept: list[tuple[Ints, Array]] = []
+        self._joined: Any = np.zeros((here[1] - here[0], 0))
         self.order, self.x, self.room, self.marks = np.zeros(n, np.intc), np.zeros(n), np.zeros(3 * n), np.zeros(n, "b")
 
     def enter(self, nodes: Ints) -> None:
@@ -70,14 +70,21 @@ class NodalMass:
             mine = (order >= self.here[0]) & (order < self.here[1])
             self.kept.append((order[mine] - self.here[0], x[mine]))
         self.block = block
-        self._join()
 
-    def _join(self) -> None:
+    @property
+    def columns(self) -> Any:
+        """M^-1 e of every column on the rows here, (rows here, count) [1/kg]."""
         shape = self.here[1] - self.here[0], len(self.kept)
+        if self._joined.shape != shape:
+            ends, rows, values = self.entries()
+            columns = csc_matrix((values, rows, ends), shape=shape)
+            self._joined = columns if len(values) < DENSE * shape[0] * shape[1] else columns.toarray(order="F")
+        return self._joined
+
+    def entries(self) -> tuple[Ints, Ints, Array]:
+        """Where each column begins, and nodes and values of all that is kept; there must be a column."""
         rows, values = (np.concatenate(parts) for parts in zip(*self.kept, strict=True))
-        ends = np.cumsum([0, *(len(each) for each, _ in self.kept)])
-        columns = csc_matrix((values, rows, ends), shape=shape)
-        self.columns = columns if len(values) < DENSE * shape[0] * shape[1] else columns.toarray(order="F")
+        return np.cumsum([0, *(len(each) for each, _ in self.kept)]), rows, values
 
     def solve(self, nodes: Ints, b: Array) -> tuple[Ints, Array]:
         """Nodes (m,) that M^-1 b reaches, and its values there, for b (k,) at k nodes, zero elsewhere.

@@ -98,11 +98,15 @@ class SmallProblem:
             self.fit(len(W))
         failed = self._in_numpy(p, W, q, tol) if self.code is None else self._in_c(p, W, q, tol)
         if failed:
-            raise SolverError(
-                f"the contact problem of {p} rows has no solution that {self.most * p} rounds find; obstacles that "
-                "leave the tissue no room are the usual reason: move one, or take more time.steps"
-            )
+            raise SolverError(self.unsolved(p))
         return self.x[:p]
+
+    def unsolved(self, p: int) -> str:
+        """The sentence on p rows for which the rounds do not end."""
+        return (
+            f"the contact problem of {p} rows has no solution that {self.most * p} rounds find; obstacles that "
+            "leave the tissue no room are the usual reason: move one, or take more time.steps"
+        )
 
     def _in_c(self, p: int, W: Array, q: Array, tol: float) -> int:
         assert self.code is not None

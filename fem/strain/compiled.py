@@ -23,7 +23,7 @@ FLAGS = (f"-DLANES={LANES}", "-O3", "-march=native", "-fno-math-errno", "-fno-tr
 
 @functools.cache
 def library(
-    source: Path, declaration: str, otherwise: str, header: Path | None = None, defined: tuple[str, ...] = ()
+    source: Path, declaration: str, otherwise: str, headers: tuple[Path, ...] = (), defined: tuple[str, ...] = ()
 ) -> Any:
     """(ffi, library) of a C source; None, with a warning, where it cannot be compiled.
 
@@ -31,13 +31,13 @@ def library(
         source: C file.
         declaration: of its functions, for cffi.
         otherwise: the way that is used instead, begins the warning.
-        header: file beside law.h that it includes.
+        headers: files beside law.h that it includes.
         defined: macros, NAME=VALUE.
     """
     try:
         from cffi import FFI  # it comes with FFCx, not with every online machine
 
-        path = _shared(source, header, tuple(f"-D{macro}" for macro in defined))
+        path = _shared(source, headers, tuple(f"-D{macro}" for macro in defined))
         ffi = FFI()
         ffi.cdef(declaration)
         return ffi, ffi.dlopen(str(path))
@@ -52,13 +52,13 @@ def library(
         return None
 
 
-def _shared(source: Path, header: Path | None, macros: tuple[str, ...]) -> Path:
+def _shared(source: Path, headers: tuple[Path, ...], macros: tuple[str, ...]) -> Path:
     """The shared library in the cache folder, made there unless it is there, named by hashes of source and machine."""
     compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
         raise OSError("there is no C compiler")
-    folders = [f"-I{folder}" for folder in (LAWS, *([] if header is None else [header.parent]))]
-    files = [source, LAWS / "law.h", *([] if header is None else [header])]
+    folders = [f"-I{folder}" for folder in dict.fromkeys((LAWS, *(header.parent for header in headers)))]
+    files = [source, LAWS / "law.h", *headers]
     texts = *(file.read_text() for file in files), compiler, *FLAGS, *macros, _processor()
     key = hashlib.sha256("\0".join(texts).encode()).hexdigest()[:20]
     root = cache_folder()

@@ -12,17 +12,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles import HalfSpace
-from softgrasp.fem.obstacles.compiled import contact_library
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.obstacles.compiled import BALANCE, DONE, ENTER, TAKE, UNSETTLED, contact_library
+from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.contact.general import MOST, ROUNDING, STILL, Contact, unsettled
 from softgrasp.fem.run.contact.rows import Ints, Rows
+from softgrasp.fem.run.contact.stops import Stops
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import Driven
 
-KINDS = {np.dtype(float): "double[]", np.dtype(np.intc): "int[]", np.dtype(bool): "char[]"}
+KINDS = {
+    np.dtype(float): "double[]", np.dtype(np.intc): "int[]", np.dtype(bool): "char[]", np.dtype(np.int64): "long[]",
+}  # fmt: skip
 """Types in C."""
 
 
@@ -30,43 +34,69 @@ class FlatContact(Contact):
     """`Contact` of one run with half-spaces; there must be a compiler."""
 
     def __init__(self, model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> None:
-        super().__init__(model, midpoint, steps, hand)
         self.ffi, self.c = contact_library()
+        self.f, self.arrays = self.ffi.new("Flat *"), dict[str, NDArray[Any]]()
+        super().__init__(model, midpoint, steps, hand)
         shapes = [o.shape for o in self.obstacles]
         self.normals = np.array([s.normal for s in shapes if isinstance(s, HalfSpace)])
-        self.along = self._axes()
+        self.along = np.ascontiguousarray(self._axes())
         self.offsets = np.array([s.offset for s in shapes if isinstance(s, HalfSpace)])
         self.moving = [(i, o) for i, o in enumerate(self.obstacles) if o.path is not None]
         self.x = np.zeros(0)
-        self.f, self.arrays, self.reached = self.ffi.new("Flat *"), dict[str, NDArray[Any]](), self.ffi.new("double *")
+        self.alone = self.layout.comm.size == 1 and self.surface.B is None
         self._describe()
-        self.row, self.W, self.pressed = np.zeros((0, 4), np.intc), np.zeros((0, 0)), False
+        self._describe_hand()
+        self.row, self.W, self.stops = np.zeros((0, 4), np.intc), np.zeros((0, 0)), Stops(self)
         self._grow(16, 0)
+
+    @property
+    def fastest(self) -> float:
+        """Largest velocity of a boundary node in a step with contact [m/s]."""
+        return float(self.f.fastest)
+
+    @fastest.setter
+    def fastest(self, speed: float) -> None:
+        self.f.fastest = speed
 
     def _axes(self) -> Array:
         """Directions of the rows of a pair, the normal first, (obstacles, rows, d)."""
         return self.normals[:, None]
 
     def _describe(self) -> None:
-        """Fill the struct of `contact.c`."""
+        """Fill the struct of `flat.h`."""
         m, f, table, (obstacles, d), size = self.midpoint, self.f, self.table, self.normals.shape, self.p * self.d
         at = np.full(size, -1, np.intc)
         if self.surface.B is None:
             at[self.order] = self.places
         f.p, f.d, f.n_s, f.obstacles, f.m = self.p, d, self.layout.n_s, obstacles, self.along.shape[1] - 1
-        f.n, f.whole, f.k = len(m.w_array), at.min(initial=0) >= 0, 0
-        self.v, self.q, self.qdot = np.zeros(size), np.zeros(f.n_s), np.zeros(f.n_s)
+        f.n, f.here, f.whole = len(m.w_array), self.layout.n_local, at.min(initial=0) >= 0
+        f.dt, f.s, f.extent, f.rounding, f.at_rest = self.dt, self.s, self.layout.extent, ROUNDING, STILL
+        f.most, f.most_each, f.compiled = MOST, self.small.most, f.m == 0 and self.surface.B is None
+        self.v, self.q = np.zeros(size), np.zeros(f.n_s)
         self.level, self.rate, self.least = self.offsets.copy(), np.zeros((obstacles, d)), np.zeros(obstacles)
-        self.q0, self.slide = np.zeros(f.n_s), np.zeros((obstacles, d))
+        self.slide = np.zeros((obstacles, d))
         self.gaps, self.after = np.zeros((2, obstacles, self.p))
         self.entered = np.zeros((obstacles, self.p), dtype=bool)
+        rows = self.surface.rows.astype(np.intc) if self.alone else np.zeros(0, np.intc)
         self._point(
-            X=self.surface.X, T=np.ascontiguousarray(self.surface.T), along=np.ascontiguousarray(self.along), at=at,
-            w=m.w_array, r=m.r_array, z=self.z, moved=self.moved, v=self.v, q=self.q, qdot=self.qdot, q0=self.q0,
+            X=self.surface.X, T=np.ascontiguousarray(self.surface.T), along=self.along, at=at, rows=rows,
+            w=m.w_array, r=m.r_array, z=self.z, moved=self.moved, v=self.v, q=self.q,
             slide=self.slide, level=self.level, rate=self.rate, gap=self.gaps, after=self.after,
-            entered=self.entered, least=self.least, force=table.force, touching=table.touching, hand=table.hand,
-            gaps=table.gap, energy=table.energy,
+            entered=self.entered, least=self.least, force=table.force, impulse=table.impulse, touching=table.touching,
+            hand=table.hand, kick=table.kick, gaps=table.gap, energy=table.energy,
         )  # fmt: skip
+
+    def _describe_hand(self) -> None:
+        """The same of a hand that feels the tissue."""
+        hand, f = self.hand, self.f
+        f.feels = hand is not None
+        self.pulled = np.zeros(f.n_s)
+        if hand is not None:
+            f.kappa = hand.kappa
+            self._point(
+                Y=np.ascontiguousarray(self.midpoint.Y.T), G=np.ascontiguousarray(self.midpoint.G.T),
+                inverse=np.ascontiguousarray(hand.inverse), pulled=self.pulled,
+            )  # fmt: skip
 
     def _point(self, **arrays: NDArray[Any]) -> None:
         """Let fields of the struct point at arrays, which are kept."""
@@ -82,6 +112,7 @@ class FlatContact(Contact):
         super().start(state, q, n)
         z[:], self.moved[:], self.q[:], self.f.whole = self.z, 0.0, q, False
         self._place(n)
+        self._point(q=self.q, q0=self.q)
         self.c.softgrasp_look(self.f)  # the bits of a run that is not restarted here
         gaps[:], self.z, self.gaps, self.f.whole = self.after, z, gaps, whole
 
@@ -92,47 +123,31 @@ class FlatContact(Contact):
             self.rate[i] = obstacle.rate(n * self.dt)
             self.slide[i] = obstacle.shift(n * self.dt) - obstacle.shift((n - 1) * self.dt)
 
-    def _look(self, n: int) -> float:
-        """Gaps at the end of step n, with the tolerance of their rounding. Collective."""
-        assert self.drive is not None
-        if not self.f.whole:
-            self.moved[:] = self._take(self.midpoint.w_array)
-        self.q[:] = self.drive.q[n + 1]
-        self.tol = ROUNDING * (float(self.c.softgrasp_look(self.f)) + self.layout.extent)
-        return self.tol
-
     def press(self, n: int, drive: Driven) -> None:
         """See :meth:`Contact.press`. Collective."""
-        self.n, self.drive, self.q0[:] = n, drive, drive.q[n]
+        f, step = self.f, self.c.softgrasp_step
+        if drive is not self.drive:
+            self._point(qs=drive.q, vs=drive.v, cs=drive.c)
+        self.n, self.drive = n, drive
         self._place(n + 1)
-        tol = self._look(n)
-        self.pressed = bool((self.least < 0).any())
-        if not self.pressed:
-            return
-        self.c.softgrasp_begin(self.f)
-        self._settle_flat(n, tol, drive)
-        self._add_between()
-        self.c.softgrasp_account(self.f, n)
-
-    def _settle_flat(self, n: int, tol: float, drive: Driven) -> None:
-        """Forces of the step, by rounds in which rows enter. Collective."""
-        c, f, responses = self.c, self.f, self.responses
-        if c.softgrasp_missing(f, 0.0, self.reached):
-            self._enter(np.argwhere((self.after < 0) & ~self.entered))
-        for _ in range(MOST):
-            x = self._balance(tol / 4)
-            c.softgrasp_apply(f, responses.count, self.ffi.from_buffer("double[]", x))
-            self._push_hand(n, self.change[: responses.count], drive)
-            self._look(n)
-            if c.softgrasp_missing(f, tol, self.reached):
-                self._enter(np.argwhere((self.after < -tol) & ~self.entered))
-            elif self.reached[0] <= tol:
-                self.midpoint.w.stateIncrease()
-                self.midpoint.r.stateIncrease()
-                return
+        f.stage = 0
+        while (wanted := step(f, n)) != DONE:
+            if wanted == TAKE:
+                self.moved[:] = self._take(self.midpoint.w_array)
+            elif wanted == ENTER:
+                self._enter(np.argwhere((self.after < -f.depth) & ~self.entered))
+            elif wanted == BALANCE:
+                self._point(to=self._balance(f.tol / 4))
             else:
-                self._refresh()  # what rounding left
-        raise unsettled(float(self.reached[0]))
+                raise unsettled(f.reached) if wanted == UNSETTLED else SolverError(self.small.unsolved(f.k))
+        if not f.pressed:
+            return
+        self.midpoint.w.stateIncrease()
+        self.midpoint.r.stateIncrease()
+        self.midpoint.c = drive.c[n]
+        if self.surface.B is not None:  # the forces on points are not on single unknowns
+            self.forces = self.pressing().ravel()
+            self._add_to_r()
 
     def _balance(self, tol: float) -> Array:
         """Forces of the rows that leave no gap below -tol."""
@@ -149,64 +164,71 @@ class FlatContact(Contact):
         self.entered[pairs[:, 0], pairs[:, 1]] = True
         if k > len(self.W):
             self._grow(max(16, 2 * k), have)
-        self.f.k = k
-        self._point(row=self.row, columns=self.responses.columns.T)
+        self.f.k, self.f.count_columns = k, self.responses.count
+        self._point(row=self.row, columns=self.responses.columns.T, B=self.responses.B)
         every = self.row[:, 2]
         G = self.responses.G[np.ix_(every, every[have:])]
         self.W[:k, have:k], self.W[have:k, :k] = G, G.T
-        self._refresh()
+        self.c.softgrasp_refresh(self.f)
+        self.stops.extend()
 
     def _grow(self, size: int, have: int) -> None:
         """Room for rows, beside the first ones."""
         W, x = np.zeros((size, size)), np.zeros(size)
         W[:have, :have] = self.W[:have, :have]
         x[:have] = self.x[:have]
-        self.W, self.x, self.free, self.stops, self.change = W, x, *np.zeros((3, size))
-        self._point(x=self.x, free=self.free, b=self.stops, change=self.change)
+        self.W, self.x, self.free, self.rates, self.struck = W, x, *np.zeros((3, size))
+        self._point(W=W, x=x, free=self.free, b=self.rates, y=self.struck, change=np.zeros(size))
+        self.f.ld = size
+        self.stops.grow(size)
+        self._fit(size)
 
-    def _refresh(self) -> None:
-        """Gaps of the rows without their forces, from the gaps with them."""
-        k = len(self.row)
-        self.c.softgrasp_values(self.f, self.ffi.from_buffer("double[]", self.free))
-        self.free[:k] -= self.W[:k, :k] @ self.x[:k]
+    def _fit(self, size: int) -> None:
+        """Room of the small problem."""
+        small = self.small
+        small.fit(size)
+        self._point(
+            count=small.count, order=small.order, L=small.L, to=small.x, side=small.side, room=small.room,
+            tally=small.tally,
+        )  # fmt: skip
 
     def finish(self, state: TissueState) -> None:
         """See :meth:`Contact.finish`. Collective."""
-        self.c.softgrasp_carry(self.f, self.n, self.pressed)
+        f, n_local = self.f, self.layout.n_local
+        v = self.ffi.from_buffer("double[]", state.array) + n_local
+        if f.pressed and not self.alone:
+            self.v[:] = self.surface.gather(state.v.array_r)
+        moves = self.c.softgrasp_finish(f, self.n, v if self.alone else self.ffi.NULL)
         if self.surface.B is not None:
             self._carry_between(state)
-        if not self.pressed:
+        if not f.pressed:
             return
-        assert self.drive is not None
-        n = self.n + 1
         self.midpoint.r.stateIncrease()
-        self.v[:], self.qdot[:] = self.surface.gather(state.v.array_r), self.drive.v[n]
-        self.reached[0] = self.fastest
-        most = self.c.softgrasp_rates(self.f, self.reached)
-        self.fastest = self.reached[0]
-        still = max(STILL * self.fastest, self.s * self.tol)
-        if most > still:
-            self._halt_flat(state, n, still)
-
-    def _add_between(self) -> None:
-        """Give r the forces on points, which are not on single unknowns. Collective."""
-        if self.surface.B is not None:
-            self.forces = self.pressing().ravel()
-            self._add_to_r()
+        if moves:
+            if f.feels:
+                self.pulled[:] = total(self.layout.comm, self.system.G.T @ state.v.array_r)
+            self._halt_flat(state, v)
 
     def _carry_between(self, state: TissueState) -> None:
         """Carry the points on to the bits that a restart finds, and r with them. Collective."""
         self.z[:], self.moved[:] = self.surface.gather(state.z.array_r), 0.0
         self.c.softgrasp_look(self.f)
         self.gaps[:], self.table.gap[self.n + 1] = self.after, self.least
-        if self.pressed:
+        if self.f.pressed:
             self._add_to_r()
 
-    def _halt_flat(self, state: TissueState, n: int, still: float) -> None:
-        """The impulse on pressed rows, one of which is faster than ``still``. Collective."""
+    def _halt_flat(self, state: TissueState, v: Any) -> None:
+        """The impulse on pressed rows, one of which moves; v: pointer to the velocities here. Collective."""
+        if self.surface.B is None:
+            if self.c.softgrasp_stop(self.f, self.n, v) == ENTER:
+                self.stops.enter()
+                self.c.softgrasp_stop(self.f, self.n, v)
+            state.v.stateIncrease()
+            return
         rows = self._pressed_rows()
         assert self.drive is not None
-        self.strike.stop(state, self.drive, n, rows.obstacle, rows.node, rows.normal, self.stops[: len(rows.node)])
+        b = self.rates[: len(self.row)][self.x[: len(self.row)] > 0]
+        self.strike.stop(state, self.drive, self.n + 1, rows.obstacle, rows.node, rows.normal, b)
 
     def _pressed_rows(self) -> Rows:
         on = np.flatnonzero(self.x[: len(self.row)] > 0)
@@ -216,7 +238,7 @@ class FlatContact(Contact):
     def pressing(self) -> Array:
         """See :meth:`Contact.pressing`."""
         forces = np.zeros((self.p, self.d))
-        if self.pressed:
+        if self.f.pressed:
             rows = self._pressed_rows()
             np.add.at(forces, rows.node, rows.forces())
         return forces
@@ -235,3 +257,5 @@ class FlatContact(Contact):
         rows, order, L = sets
         self._enter(rows.reshape(-1, 2).astype(int))
         self.small.resume(order.astype(int), L, len(self.W))
+        self._fit(len(self.W))
+        self.stops.extend()

@@ -56,33 +56,28 @@ class RubbingRows(Rows):
         return np.asarray(self.x[:, None] * self.normal + np.einsum("ka,kad->kd", self.x_t, self.tangent))
 
 
-def stop_rubbing(contact: Contact, jolt: Coulomb, state: TissueState, n: int, rows: RubbingRows, mu: Array,
-                 along: Array, v: Array, still: float) -> bool:  # fmt: skip
-    """Whether an impulse with friction stops rows at the end of step n; if not, nothing has changed. Collective.
-
-    It does not where the friction of its nodes would not take energy, over the whole step.
+def rubbing_impulse(
+    contact: Contact, jolt: Coulomb, rows: RubbingRows, mu: Array, A: Array, v: Array, still: float
+) -> Array | None:
+    """Impulse with friction (k d,) that stops rows; None where the friction of the step with it would not take energy.
 
     Args:
         jolt: problem of the impulses, without forces or sets of its own.
         mu: coefficients of friction, (k,).
-        along: normal and tangents of each row, (k, d, d).
+        A: N M^-1 N' of the rows, a normal and then its tangents, (k d, k d).
         v: velocities along them, (k, d).
         still: velocity that is rounding [m/s].
     """
-    k, s = v.shape
-    obstacle, node, axes = np.repeat(rows.obstacle, s), np.repeat(rows.node, s), along.reshape(-1, s)
-    A, before = contact.strike.reactions().matrix(node, axes), np.ascontiguousarray(v.ravel())
+    (k, s), before = v.shape, np.ascontiguousarray(v.ravel())
     pushed = contact.dt * np.column_stack([rows.x, rows.x_t])
     jolt.fit(k)
     jolt.x[:], jolt.kind[:], jolt.e[:] = pushed, rows.kind, rows.e
     y = (jolt.solve(k, np.ascontiguousarray(A), before - A @ pushed.ravel(), mu, still) - pushed).ravel()
     taken = (-y * (before + A @ y / 2)).reshape(k, s)
     if taken[:, 1:].sum() - np.einsum("ka,ka->", rows.x_t, rows.slip) < 0:
-        return False
+        return None
     contact.table.energy[2:] += taken[:, 0].sum(), taken[:, 1:].sum()
-    assert contact.drive is not None
-    contact.strike.strike(state, contact.drive, n, obstacle, node, axes, y)
-    return True
+    return y
 
 
 class FrictionContact(Contact):
@@ -155,8 +150,14 @@ class FrictionContact(Contact):
         stuck = rows.kind == STICK
         if max(np.abs(speed[:, 0]).max(), np.abs(speed[stuck]).max(initial=0.0)) <= still:
             return
-        if not stop_rubbing(self, self.jolt, state, n, rows, self.mu[rows.obstacle], along, speed, still):
+        obstacle, node, axes = (np.repeat(rows.obstacle, d := self.d), np.repeat(rows.node, d), along.reshape(-1, d))
+        A = self.strike.reactions().matrix(node, axes)
+        y = rubbing_impulse(self, self.jolt, rows, self.mu[rows.obstacle], A, speed, still)
+        if y is None:
             super()._halt(state, n, rows, normal, v, still)
+            return
+        assert self.drive is not None
+        self.strike.strike(state, self.drive, n, obstacle, node, axes, y)
 
     def _sets(self) -> list[NDArray[Any]]:
         """See :meth:`Contact._sets`."""
@@ -212,12 +213,15 @@ class FlatFriction(FlatContact):
         self._point(kind=self.coulomb.kind)
         self.friction = self.mu[self._pairs()[:, 0]]
 
+    def _fit(self, size: int) -> None:
+        """See :meth:`FlatContact._fit`: without the problem of normal forces alone."""
+
     def _balance(self, tol: float) -> Array:
         """See :meth:`FlatContact._balance`."""
         k = self.f.k
         x = self.coulomb.solve(k // self.d, self.W, self.free[:k], self.friction, tol)
         self.small.tally[0] = self.coulomb.tally[0]
-        return x
+        return x.ravel()
 
     def _pressed_rows(self) -> RubbingRows:
         s, k = self.d, len(self.row)
@@ -230,16 +234,24 @@ class FlatFriction(FlatContact):
             2 * slip.reshape(-1, s)[on, 1:], self.coulomb.kind[on], self.coulomb.e[on],
         )  # fmt: skip
 
-    def _halt_flat(self, state: TissueState, n: int, still: float) -> None:
+    def _halt_flat(self, state: TissueState, v: Any) -> None:
         """See :meth:`FlatContact._halt_flat`. Collective."""
-        rows, s = self._pressed_rows(), self.d
-        v = -self.stops[: s * len(rows.node)].reshape(-1, s)
-        mu, along = self.mu[rows.obstacle], self.along[rows.obstacle]
-        if not stop_rubbing(self, self.jolt, state, n, rows, mu, along, v, still):
-            b = -v[:, 0]
-            if np.abs(b).max() > still:
-                assert self.drive is not None
-                self.strike.stop(state, self.drive, n, rows.obstacle, rows.node, rows.normal, b)
+        rows, s, k = self._pressed_rows(), self.d, len(self.row)
+        on = np.flatnonzero(np.repeat(self.x[:k:s] > 0, s))
+        if on[-1] >= self.f.struck:
+            self.stops.enter()
+        A, before = self.stops.A[np.ix_(on, on)], -self.rates[on].reshape(-1, s)
+        y = rubbing_impulse(self, self.jolt, rows, self.mu[rows.obstacle], A, before, self.f.still)
+        self.struck[:k] = 0.0
+        if y is None:
+            first = on[::s]
+            if np.abs(self.rates[first]).max() <= self.f.still:
+                return
+            y, on = np.linalg.solve(self.stops.A[np.ix_(first, first)], self.rates[first]), first
+            self.table.energy[2] += y @ self.rates[first] / 2
+        self.struck[on] = y
+        self.c.softgrasp_strike(self.f, self.n, v)
+        state.v.stateIncrease()
 
     def _sets(self) -> list[NDArray[Any]]:
         """See :meth:`Contact._sets`."""

@@ -1,0 +1,60 @@
+/* The step before half-spaces, see contact.c: its data, and what it needs before it goes on. */
+#include "dense.h"
+
+enum { MODES = 8 }; /* freedoms of a hand, at most */
+enum { DONE, TAKE, ENTER, BALANCE, UNSOLVED, UNSETTLED };
+enum { BEGIN, UNTOUCHED, ROWS, FORCES, AFTER };
+
+typedef struct {
+  int p, d, n_s, obstacles; /* boundary nodes, axes, freedoms of the hand, half-spaces */
+  int m;                    /* tangents with friction */
+  int n, whole;             /* rows here of the step, whether they are all rows */
+  int here;                 /* rows here of the state */
+  int k, ld;                /* contact rows, and columns of W, L, A and LA */
+  int count_columns;        /* of S^-1 N' */
+  int feels, compiled;      /* whether the hand feels the tissue; whether the small problem is solved here */
+  double dt, s, kappa;      /* step, 2 / dt, 1 + alpha dt / 2 */
+  double extent, rounding;  /* size of the body, rounding of a gap over its coordinates */
+  double at_rest;           /* rounding of a velocity over the largest */
+  int most, most_each;      /* rounds of a step, and of the small problem for each row */
+  const double *X, *T;      /* places at rest (p, d), modes of the hand (p d, n_s) */
+  const double *along;      /* normals of the half-spaces, each before its tangents (obstacles, 1 + m, d) */
+  const int *at;            /* row here of each unknown of the boundary, -1 where another rank has it (p d) */
+  const int *rows;          /* the same of the state, where one rank has all (p d) */
+  double *w, *r;            /* half the change of z in the step, and its right-hand side (n) */
+  double *z, *moved, *v;    /* displacement, its half change and velocity of the boundary (p d) */
+  double *qs, *vs, *cs;     /* hand, its velocity (steps + 1, n_s) and its load (steps, n_s) */
+  const double *q, *q0;     /* hand at the end of the step and at the start of it (n_s) */
+  const double *slide;      /* way of the half-spaces in the step (obstacles, d) */
+  double *level, *rate;     /* n.x of the half-spaces at the end of the step (obstacles), velocities (obstacles, d) */
+  double *gap, *after;      /* gaps before and at the end of the step (obstacles, p) */
+  char *entered;            /* whether a pair has a row (obstacles, p) */
+  double *least;            /* least gaps at the end (obstacles) */
+  const int *row;           /* obstacle, node, column and direction of each contact row, 0 for the normal (k, 4) */
+  const int *kind;          /* sets of the pairs, see friction.c; 0 without friction */
+  const double *columns;    /* S^-1 N' on the rows here, a column after the other (.., n) */
+  const double *W;          /* N S^-1 N', with the hand's part where it feels the tissue (k, k) */
+  double *free, *x, *b;     /* right-hand side of the small problem, forces, velocities to stop (k) */
+  double *change;           /* what the last `apply` added to the force of each column */
+  const double *B, *Y, *G;  /* of a hand that feels the tissue: directions times reach (columns, n_s), S^-1 G, G (n_s, n) */
+  const double *inverse;    /* L^-1 of its equation (n_s, n_s) */
+  int *count, *order, *side; /* small problem, see `softgrasp_complement` */
+  double *L, *to, *room;
+  long *tally;
+  int stage, round, pressed; /* where the step is, its rounds, whether a row may be pressed */
+  double tol, depth, reached; /* tolerance of gaps, depth from which pairs enter, largest gap of pressed rows */
+  double fastest, still;    /* largest velocity of a pressed node so far, and what is at rest against it */
+  int struck, stopping;     /* rows with a column of M^-1, and rows of the factor LA */
+  int *stopped;             /* which */
+  const double *A;          /* N M^-1 N', with the hand's part (struck, struck) */
+  double *LA, *y;           /* factor of A at the stopped rows, impulses (k) */
+  const int *column;        /* column of M^-1 of each row (struck) */
+  const int *ends, *reached_nodes; /* its entries here: where each column begins, their nodes */
+  const double *shares;     /* and values */
+  const double *starts;     /* G'M^-1 of each column and axis (columns, d, n_s) */
+  const double *reach, *X_hand; /* N (T - M^-1 G) (struck, n_s), M^-1 G here (n_s, here) */
+  const double *H, *GX;     /* (M_hand + M_rigid - G'M^-1 G)^-1, G'M^-1 G (n_s, n_s) */
+  double *pulled;           /* G'v before the impulse (n_s) */
+  double *force, *impulse, *touching, *hand, *kick, *gaps; /* tables of the run, see Tables */
+  double *energy;           /* work, energy dissipated at first touch, by impulses, by friction (4) */
+} Flat;

@@ -1,0 +1,87 @@
+"""Impulses before half-spaces: what `contact.c` needs of the inverse mass for the rows that ever touched."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softgrasp.fem.petsc import Array, total
+
+if TYPE_CHECKING:
+    from softgrasp.fem.run.contact.flat import FlatContact
+
+
+class Stops:
+    """A = N M^-1 N' of the first rows of a contact, with the hand's part, and the columns of M^-1 behind it.
+
+    Rows get theirs together, when an impulse first needs one. Every number is that of its column or pair of columns
+    alone, so that a resumed run has the same bits.
+    """
+
+    def __init__(self, contact: FlatContact) -> None:
+        self.contact, self.A, self.reach, self.starts = contact, np.zeros((0, 0)), np.zeros((0, 0)), list[Array]()
+
+    def grow(self, size: int) -> None:
+        """Room for rows, beside those there; none before the first impulse."""
+        have = len(self.A)
+        if not have:
+            return
+        A, reach = np.zeros((size, size)), np.zeros((size, self.reach.shape[1]))
+        A[:have, :have], reach[:have] = self.A, self.reach
+        self.A, self.reach, self.contact.f.stopping = A, reach, 0
+        self.contact._point(A=A, LA=np.zeros((size, size)), stopped=np.zeros(size, np.intc), reach=reach)
+
+    def enter(self) -> None:
+        """Make the columns of all rows. Collective. Raises SolverError: a column of M^-1 does not converge."""
+        impulses = self.contact.strike.reactions()
+        impulses.mass.enter(impulses.numbers[self.contact.row[:, 1]])
+        self.extend()
+
+    def extend(self) -> None:
+        """Take in the rows that follow and whose nodes have columns. Collective."""
+        contact, impulses = self.contact, self.contact.strike.impulses
+        if impulses is None or contact.surface.B is not None or not len(impulses.mass.nodes):
+            return
+        f, mass, have = contact.f, impulses.mass, int(contact.f.struck)
+        at = mass.where[impulses.numbers[contact.row[:, 1]]]
+        count = int(np.append(at < 0, True).argmax())
+        if count == have:
+            return
+        if not len(self.A):
+            self._begin()
+        at, row, new = at[:count], contact.row[:count], slice(have, count)
+        along = contact.along[row[:, 0], row[:, 3]]
+        # sums of few terms by einsum, whose bits do not depend on the number of rows
+        more = mass.block[np.ix_(at, at[new])] * np.einsum("ia,ja->ij", along, along[new])
+        if f.feels:
+            self.reach[new] = impulses._reach(row[new, 1], along[new])
+            answers = np.einsum("ij,kj->ki", np.linalg.inv(impulses.H), self.reach[new])
+            more += np.einsum("ik,jk->ij", self.reach[:count], answers)
+        self.A[:count, new], self.A[new, :count] = more, more.T
+        ends, nodes, shares = mass.entries()
+        f.struck = count
+        contact._point(
+            column=at.astype(np.intc), ends=ends.astype(np.intc), reached_nodes=nodes.astype(np.intc), shares=shares,
+            starts=self._starts(),
+        )  # fmt: skip
+
+    def _begin(self) -> None:
+        """Room for all rows, and what impulses do to the hand. Collective."""
+        contact, impulses = self.contact, self.contact.strike.reactions()
+        self.A, self.reach = np.zeros((1, 1)), np.zeros((1, contact.f.n_s))
+        self.grow(len(contact.W))
+        if contact.f.feels:
+            contact._point(
+                X_hand=np.ascontiguousarray(impulses.X.T), H=np.ascontiguousarray(np.linalg.inv(impulses.H)),
+                GX=np.ascontiguousarray(total(contact.layout.comm, contact.system.G.T @ impulses.X)),
+            )  # fmt: skip
+
+    def _starts(self) -> Array:
+        """G'M^-1 of every column and axis, (columns, d, n_s). Collective."""
+        contact, mass = self.contact, self.contact.strike.reactions().mass
+        G = contact.system.G.reshape(-1, contact.d, contact.f.n_s)
+        new = [np.einsum("i,iak->ak", values, G[nodes]) for nodes, values in mass.kept[len(self.starts) :]]
+        if new:
+            self.starts += list(total(contact.layout.comm, np.array(new)))
+        return np.array(self.starts)
