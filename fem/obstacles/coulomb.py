@@ -2,12 +2,13 @@
 
     0 <= x_n,  y_n >= 0,  x_n y_n = 0,   |x_t| <= mu x_n,  x_t = -mu x_n y_t / |y_t| where y_t is not 0,   y = W x + q,
 
-y_t half the slip of the step; a node has one tangent in 2D and two in 3D. Newton's method on the sets open, stick and
-slip [AC91]: in 2D it is exact when the sets stay, in 3D the directions of slipping nodes converge with it. Its factor
-stays while few rows of the matrix are others: those are taken in by a small matrix of their own. Where the method comes
-back to sets seen before, sweeps of Gauss-Seidel over the nodes find others; then pivots do (`lemke.py`), which in 2D
-end at a solution but for rounding, or friction that grows. `friction.c` does so; without a compiler
-NumPy takes the same rounds, each with a factor of its own.
+y_t half the slip of the step; a node has one tangent in 2D and two in 3D. Newton's method on the sets open, stick
+and slip [AC91]: in 2D it is exact when the sets stay, in 3D the directions of slipping nodes converge with it. Its
+factor stays while few rows of the matrix are others, which a small matrix of their own takes in; in 3D Broyden's update
+takes in the directions, and rounds that reduce the residual little have it made anew. Where the method comes back to
+sets seen before, sweeps of Gauss-Seidel over the nodes find others; then pivots do (`lemke.py`), which in 2D end at a
+solution but for rounding, and in 3D lead to one by pyramids with edges nearer and nearer to the slips, or friction that
+grows. `friction.c` does so; without a compiler NumPy takes the same rounds, each with a factor of its own.
 """
 
 from __future__ import annotations
@@ -25,11 +26,13 @@ from softgrasp.fem.obstacles.compiled import RIDGE, compiled
 
 Array = NDArray[Any]
 OPEN, STICK, SLIP = range(3)
-ROUNDS = 0, 40, 15  # of Newton's method, before and after the sweeps, by the number of tangents
+ROUNDS = 0, 40, 60  # of Newton's method, before and after the sweeps, by the number of tangents
 SWEEPS = 3000
+PAST = 16  # steps of the method that are kept, one more than friction.c says
 STILL = 1e-14  # change of the forces by a sweep over the largest, at which sweeps end
 LITTLE = 0.2  # first coefficient of friction that grows
 GROWTH, LEAST = 1.4, 1.04  # by how much it does, and by how much it must
+REFINED = 6  # pyramids, each with edges three times as near to the last directions
 NEARLY = 1e-9  # of a force, below which its node slips, or is open [1]
 SOLVED, WANTED = 0, 1  # what `softgrasp_rub` says; else the rounds lead nowhere
 SOURCE = Path(__file__).with_name("friction.c")
@@ -88,13 +91,14 @@ class Coulomb:
         if self.code is None:
             return
         K = k * s
-        most = max(6, K // 6)
+        most = max(6, min(K // 6, 24))
         self.other = np.zeros(most, np.intc)
         self.LU, self.pivot, self.y = np.zeros((K, K)), np.zeros(K, np.intc), np.zeros(K)
         self._point(
             x=self.x, y=self.y, kind=self.kind, e=self.e, LU=self.LU, pivot=self.pivot, kind0=self.kind0, e0=self.e0,
             other=self.other, Z=np.zeros((most, K)), V=np.zeros((most, K)), C=np.zeros((most, most)),
-            room=np.zeros(4 * K + most), seen=np.zeros((ROUNDS[self.m], k), np.int8), tally=self.tally,
+            room=np.zeros(4 * K + most), past=np.zeros((PAST, K)),
+            seen=np.zeros((ROUNDS[self.m], k), np.int8), tally=self.tally,
         )  # fmt: skip
         self.f.k, self.f.m, self.f.most, self.f.rows, self.f.count = k, self.m, most, 0, 0
 
@@ -144,14 +148,33 @@ class Coulomb:
         """Whether the law with pyramids, in 2D the law itself, leads to a solution."""
         from softgrasp.fem.obstacles.lemke import pyramid_forces  # few runs need it
 
-        K = len(q)
-        x = pyramid_forces(W[:K, :K], q, mu, self.m)
-        if x is None:
-            return False
-        self.forget()
-        self.x[:] = x
-        self._set_kinds(mu, NEARLY * float(np.abs(x).max(initial=0.0)))
-        return self._attempt(W, q, mu, tol)
+        K, near, turn = len(q), None, math.pi / 4
+        for _ in range(1 if self.m == 1 else REFINED):
+            x = pyramid_forces(W[:K, :K], q, mu, self.m, near, turn)
+            if x is None:
+                return False
+            self.forget()
+            self.x[:] = x
+            small = NEARLY * float(np.abs(x).max(initial=0.0))
+            if self.m == 1:
+                self._set_kinds(mu, small)
+                return self._attempt(W, q, mu, tol)
+            near = self._set_kinds_by_slip(W[:K, :K], q, mu, small)
+            if self._attempt(W, q, mu, tol):
+                return True
+            turn /= 3
+        return False
+
+    def _set_kinds_by_slip(self, W: Array, q: Array, mu: Array, small: float) -> Array:
+        """Sets and directions of forces under pyramids, inside the cone where nodes slip too; directions, (k, 2)."""
+        y, w = (W @ self.x.ravel() + q).reshape(self.x.shape), W.diagonal().reshape(self.x.shape)[:, 1:2]
+        size = np.linalg.norm(y[:, 1:], axis=1)
+        slips = (self.x[:, 0] > small) & (size > small * w[:, 0])
+        self.kind[:] = np.select([self.x[:, 0] <= small, slips], [OPEN, SLIP], STICK)
+        near = np.where(slips[:, None], -y[:, 1:] / np.where(size > 0, size, 1.0)[:, None], np.nan)
+        self.e[slips, :-1] = near[slips]
+        self.e[slips, -1] = (mu * self.x[:, 0])[slips] / np.linalg.norm(self.x[:, 1:] - y[:, 1:] / w, axis=1)[slips]
+        return near
 
     def _set_kinds(self, mu: Array, small: float = 0.0) -> None:
         """Sets and directions of the present forces, of which ``small`` ones are rounding [N]."""

@@ -4,6 +4,8 @@
 
 enum { OPEN, STICK, SLIP };
 enum { SOLVED = 0, WANTED = 1, CYCLED = 2 };
+enum { LATE = 2, PAST = 15 };        /* steps that are kept, at most */
+static const double SLOW = 0.3; /* by how much a round should reduce the residual */
 
 typedef struct {
   int k, m, ld;          /* nodes, tangents, columns of W */
@@ -20,6 +22,7 @@ typedef struct {
   int *other;            /* these rows (most) */
   double *Z, *V, *C;     /* factor^-1 of their units, what they are more (most, K); small matrix (most, most) */
   double *room;          /* 4 K + most numbers */
+  double *past;          /* steps of rounds in which no set changed (PAST + 1, K) */
   char *seen;            /* sets of the rounds (ROUNDS, k) */
   long *tally;           /* rounds, sweeps */
 } Rub;
@@ -243,20 +246,38 @@ static char side(const Rub *f, int i) {
   return (char)(f->kind[i] == SLIP && f->e[i * (1 + f->m)] < 0 ? 3 : f->kind[i]);
 }
 
+/* Step b of the method from that of the kept factor, with the last `taken` steps, since which no set has changed: Broyden's
+   update [Broyden65] by the steps alone. They are in `past`, and b is put behind them. */
+static void accelerate(const Rub *f, int taken, double *b) {
+  const int K = f->rows;
+  double *last = f->past + (size_t)taken * K;
+  for (int j = 0; j < taken; j++) {
+    const double *s = f->past + (size_t)j * K, *next = s + K, share = dot(K, s, b) / dot(K, s, s);
+    if (j + 1 < taken)
+      for (int r = 0; r < K; r++) b[r] += share * next[r];
+    else if (fabs(share) < 0.9)
+      for (int r = 0; r < K; r++) b[r] /= 1 - share;
+  }
+  memcpy(last, b, K * sizeof(double));
+}
+
 /* Rounds from round `begin` on. WANTED: call softgrasp_matrix, factor LU, and call again with the round in tally[2]. */
 int softgrasp_rub(Rub *f, int begin, int rounds) {
   const int s = 1 + f->m, K = f->k * s;
+  int slow = 0;
   double *b = f->room + K, *t = b + K, last = INFINITY;
-  for (int round = begin; round < rounds; round++) {
+  evaluate(f);
+  for (int round = begin, taken = 0; round < rounds; round++) {
     int count = f->rows == K ? compare(f) : 0;
     f->tally[2] = round;
     if (!count) return WANTED;
     f->tally[0]++;
     for (int i = 0; i < f->k; i++) f->seen[(size_t)round * f->k + i] = side(f, i);
-    evaluate(f);
     residual(f, b);
     solve(f, count - 1, b, t);
-    for (int r = 0; r < K; r++) f->x[r] -= b[r];
+    for (int r = 0; r < K; r++) b[r] = -b[r];
+    if (f->m > 1) accelerate(f, taken, b);
+    for (int r = 0; r < K; r++) f->x[r] += b[r];
     for (int i = 0; i < f->k; i++) { /* what a set says, exactly */
       double *x = f->x + i * s;
       for (int a = 0; a < s; a++)
@@ -275,8 +296,10 @@ int softgrasp_rub(Rub *f, int begin, int rounds) {
           same = f->seen[(size_t)p * f->k + i] == side(f, i);
         if (same) return CYCLED;
       }
-    if (!changed && left > 0.1 * last) f->rows = 0; /* directions have turned: factor anew */
-    last = changed ? INFINITY : left;
+    taken = changed ? 0 : taken + 1;
+    slow = (f->m > 1 || !changed) && left > SLOW * last ? slow + 1 : 0;
+    if (slow == LATE || taken == PAST) f->rows = slow = 0; /* directions have turned: factor anew */
+    last = f->m == 1 && changed ? INFINITY : left;
   }
   return CYCLED;
 }

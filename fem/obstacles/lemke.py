@@ -6,7 +6,8 @@ With m directions d_j of the tangents that span them with positive shares, x_t =
 
 For W positive definite the method ends at a solution for every mu [AP97], but for rounding, seen with mu of 1000 and
 more; where a node touches two obstacles W is singular, and there may be none. In 2D, d = +-1, that is Coulomb's law
-itself; in 3D the cone is a pyramid, and its solution a start for Newton's method.
+itself; in 3D the cone is a pyramid, whose solution says which nodes slip and where: pyramids with more and more edges
+there lead to the law itself.
 """
 
 from __future__ import annotations
@@ -25,27 +26,31 @@ ANEW = 30  # pivots after which the tableau is computed anew from its basis
 LEAST = 1e-11  # entry of a scaled column that may be a pivot
 
 
-def pyramid_forces(W: Array, q: Array, mu: Array, tangents: int) -> Array | None:
+def pyramid_forces(
+    W: Array, q: Array, mu: Array, tangents: int, near: Array | None = None, turn: float = 1.0
+) -> Array | None:
     """Forces x (k, 1 + tangents) of k nodes under the law with pyramids; None for many nodes, or by rounding.
 
     Args:
         W: symmetric, positive definite, (k (1 + tangents),) squared.
         q: half the gap and half the slip without forces, (k (1 + tangents),) [m].
         mu: coefficients of friction, (k,).
+        near: in 3D, direction of the force of each node around which its pyramid has edges ``turn`` and 3 ``turn``
+            apart [rad], (k, 2); all edges are the same angle apart where it is None or not a number.
     """
     k, s, sides = len(mu), 1 + tangents, SIDES[tangents - 1]
     if k * (2 + sides) > LARGEST:
         return None
-    angle = 2 * np.pi / sides * np.arange(sides)
-    d = np.array([[1.0], [-1.0]]) if tangents == 1 else np.column_stack([np.cos(angle), np.sin(angle)])
-    spread = np.zeros((s, 1 + sides))  # x of a node from x_n and its shares
-    spread[0, 0], spread[1:, 1:] = 1.0, d.T
-    E = np.kron(np.eye(k), spread)
+    pyramids = np.array([_pyramid(tangents, sides, None if near is None else near[i], turn) for i in range(k)])
     pushed, sums = 1 + sides, k * (1 + sides)
     M, right = np.zeros((sums + k,) * 2), np.zeros(sums + k)
     size, stiff = float(np.abs(q).max(initial=0.0)), float(W.diagonal().mean())
     if not size > 0:
         return np.zeros((k, s))
+    E = np.zeros((k * s, sums))  # x from x_n and the shares of each node
+    for i, d in enumerate(pyramids):
+        E[i * s, i * pushed] = 1.0
+        E[i * s + 1 : (i + 1) * s, i * pushed + 1 : (i + 1) * pushed] = d.T
     most = np.maximum(mu, 1.0)
     M[:sums, :sums], right[:sums] = E.T @ (W / stiff) @ E, E.T @ (q / size)
     for i in range(k):
@@ -58,6 +63,17 @@ def pyramid_forces(W: Array, q: Array, mu: Array, tangents: int) -> Array | None
         if z is not None:
             return (E @ z[:sums]).reshape(k, s) * (size / stiff)
     return None
+
+
+def _pyramid(tangents: int, sides: int, near: Array | None, turn: float) -> Array:
+    """Edges (sides, tangents) of a pyramid."""
+    if tangents == 1:
+        return np.array([[1.0], [-1.0]])
+    angle = 2 * np.pi / sides * np.arange(sides)
+    if near is not None and np.isfinite(near).all():
+        around = np.array([0, turn, -turn, 3 * turn, -3 * turn, np.pi / 2, np.pi, -np.pi / 2])
+        angle = np.arctan2(near[1], near[0]) + around
+    return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 def lemke(M: Array, q: Array, cover: Array) -> Array | None:

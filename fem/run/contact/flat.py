@@ -78,7 +78,7 @@ class FlatContact(Contact):
         self.gaps, self.after = np.zeros((2, obstacles, self.p))
         self.entered = np.zeros((obstacles, self.p), dtype=bool)
         rows = self.surface.rows.astype(np.intc) if self.alone else np.zeros(0, np.intc)
-        self._point(
+        self.point(
             X=self.surface.X, T=np.ascontiguousarray(self.surface.T), along=self.along, at=at, rows=rows,
             w=m.w_array, r=m.r_array, z=self.z, moved=self.moved, v=self.v, q=self.q,
             slide=self.slide, level=self.level, rate=self.rate, gap=self.gaps, after=self.after,
@@ -93,12 +93,12 @@ class FlatContact(Contact):
         self.pulled = np.zeros(f.n_s)
         if hand is not None:
             f.kappa = hand.kappa
-            self._point(
+            self.point(
                 Y=np.ascontiguousarray(self.midpoint.Y.T), G=np.ascontiguousarray(self.midpoint.G.T),
                 inverse=np.ascontiguousarray(hand.inverse), pulled=self.pulled,
             )  # fmt: skip
 
-    def _point(self, **arrays: NDArray[Any]) -> None:
+    def point(self, **arrays: NDArray[Any]) -> None:
         """Let fields of the struct point at arrays, which are kept."""
         for name, array in arrays.items():
             setattr(self.f, name, self.ffi.from_buffer(KINDS[array.dtype], array))
@@ -112,7 +112,7 @@ class FlatContact(Contact):
         super().start(state, q, n)
         z[:], self.moved[:], self.q[:], self.f.whole = self.z, 0.0, q, False
         self._place(n)
-        self._point(q=self.q, q0=self.q)
+        self.point(q=self.q, q0=self.q)
         self.c.softgrasp_look(self.f)  # the bits of a run that is not restarted here
         gaps[:], self.z, self.gaps, self.f.whole = self.after, z, gaps, whole
 
@@ -127,7 +127,7 @@ class FlatContact(Contact):
         """See :meth:`Contact.press`. Collective."""
         f, step = self.f, self.c.softgrasp_step
         if drive is not self.drive:
-            self._point(qs=drive.q, vs=drive.v, cs=drive.c)
+            self.point(qs=drive.q, vs=drive.v, cs=drive.c)
         self.n, self.drive = n, drive
         self._place(n + 1)
         f.stage = 0
@@ -137,7 +137,7 @@ class FlatContact(Contact):
             elif wanted == ENTER:
                 self._enter(np.argwhere((self.after < -f.depth) & ~self.entered))
             elif wanted == BALANCE:
-                self._point(to=self._balance(f.tol / 4))
+                self.point(to=self._balance(f.tol / 4))
             else:
                 raise unsettled(f.reached) if wanted == UNSETTLED else SolverError(self.small.unsolved(f.k))
         if not f.pressed:
@@ -165,7 +165,7 @@ class FlatContact(Contact):
         if k > len(self.W):
             self._grow(max(16, 2 * k), have)
         self.f.k, self.f.count_columns = k, self.responses.count
-        self._point(row=self.row, columns=self.responses.columns.T, B=self.responses.B)
+        self.point(row=self.row, columns=self.responses.columns.T, B=self.responses.B)
         every = self.row[:, 2]
         G = self.responses.G[np.ix_(every, every[have:])]
         self.W[:k, have:k], self.W[have:k, :k] = G, G.T
@@ -178,7 +178,7 @@ class FlatContact(Contact):
         W[:have, :have] = self.W[:have, :have]
         x[:have] = self.x[:have]
         self.W, self.x, self.free, self.rates, self.struck = W, x, *np.zeros((3, size))
-        self._point(W=W, x=x, free=self.free, b=self.rates, y=self.struck, change=np.zeros(size))
+        self.point(W=W, x=x, free=self.free, b=self.rates, y=self.struck, change=np.zeros(size))
         self.f.ld = size
         self.stops.grow(size)
         self._fit(size)
@@ -187,7 +187,7 @@ class FlatContact(Contact):
         """Room of the small problem."""
         small = self.small
         small.fit(size)
-        self._point(
+        self.point(
             count=small.count, order=small.order, L=small.L, to=small.x, side=small.side, room=small.room,
             tally=small.tally,
         )  # fmt: skip

@@ -210,7 +210,7 @@ class FlatFriction(FlatContact):
         """See :meth:`FlatContact._enter`. Collective."""
         super()._enter(pairs)
         self.coulomb.fit(len(self._pairs()))
-        self._point(kind=self.coulomb.kind)
+        self.point(kind=self.coulomb.kind)
         self.friction = self.mu[self._pairs()[:, 0]]
 
     def _fit(self, size: int) -> None:
@@ -264,4 +264,4 @@ class FlatFriction(FlatContact):
             return
         self._enter(pairs)
         self.coulomb.resume(sets[1], self.W, self.friction)
-        self._point(kind=self.coulomb.kind)
+        self.point(kind=self.coulomb.kind)

@@ -76,7 +76,7 @@ class Impulses:
             block = self.mass.block[np.ix_(at, at)]
             self.A = (block if shares is None else shares @ block @ shares.T) * (directions @ directions.T)
             if self.n_s:
-                B = self._reach(nodes, directions)
+                B = self.reach_of(nodes, directions)
                 self.A += B @ np.linalg.solve(self.H, B.T)
             self.key, self.factor = key, (np.zeros((0, 0)), True)
         return self.A
@@ -90,7 +90,7 @@ class Impulses:
         self.mass.enter(self.numbers[nodes])
         return self.mass.where[self.numbers[nodes]], shares
 
-    def _reach(self, nodes: Ints, directions: Array) -> Array:
+    def reach_of(self, nodes: Ints, directions: Array) -> Array:
         """B, (k, n_s)."""
         return np.asarray(np.einsum("ki,kij->kj", directions, self.reach.reshape(-1, self.d, self.n_s)[nodes]))
 
@@ -120,5 +120,5 @@ class Impulses:
         gained[self.surface.rows] = self.surface.on_nodes(forces.ravel())[self.surface.mine]
         if not self.n_s:
             return u, np.zeros(0), gained
-        a = np.linalg.solve(self.H, self._reach(nodes, directions).T @ y)
+        a = np.linalg.solve(self.H, self.reach_of(nodes, directions).T @ y)
         return u - self.X @ a, a, gained - self.G @ a

@@ -2,14 +2,42 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.model.surface import Surface
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.contact.strike import Strike
+from softgrasp.fem.system import BlockSystem
 
-if TYPE_CHECKING:
-    from softgrasp.fem.run.contact.flat import FlatContact
+
+class Stopped(Protocol):
+    """A contact whose rows `contact.c` stops, see :class:`softgrasp.fem.run.contact.flat.FlatContact`."""
+
+    f: Any
+    """Struct of `flat.h`."""
+    W: Array
+    """N S^-1 N' with room for more rows."""
+    row: NDArray[np.intc]
+    """Obstacle, node, column and direction of each row, (k, 4)."""
+    along: Array
+    """Directions of each obstacle, (obstacles, 1 + m, d)."""
+    d: int
+    """Axes."""
+    strike: Strike
+    """Its impulses."""
+    surface: Surface
+    """Its boundary."""
+    system: BlockSystem
+    """Its matrices."""
+    layout: BlockLayout
+    """Its unknowns."""
+
+    def point(self, **arrays: NDArray[Any]) -> None:
+        """Let fields of the struct point at arrays, which are kept."""
 
 
 class Stops:
@@ -19,7 +47,7 @@ class Stops:
     alone, so that a resumed run has the same bits.
     """
 
-    def __init__(self, contact: FlatContact) -> None:
+    def __init__(self, contact: Stopped) -> None:
         self.contact, self.A, self.reach, self.starts = contact, np.zeros((0, 0)), np.zeros((0, 0)), list[Array]()
 
     def grow(self, size: int) -> None:
@@ -30,7 +58,7 @@ class Stops:
         A, reach = np.zeros((size, size)), np.zeros((size, self.reach.shape[1]))
         A[:have, :have], reach[:have] = self.A, self.reach
         self.A, self.reach, self.contact.f.stopping = A, reach, 0
-        self.contact._point(A=A, LA=np.zeros((size, size)), stopped=np.zeros(size, np.intc), reach=reach)
+        self.contact.point(A=A, LA=np.zeros((size, size)), stopped=np.zeros(size, np.intc), reach=reach)
 
     def enter(self) -> None:
         """Make the columns of all rows. Collective. Raises SolverError: a column of M^-1 does not converge."""
@@ -55,13 +83,13 @@ class Stops:
         # sums of few terms by einsum, whose bits do not depend on the number of rows
         more = mass.block[np.ix_(at, at[new])] * np.einsum("ia,ja->ij", along, along[new])
         if f.feels:
-            self.reach[new] = impulses._reach(row[new, 1], along[new])
+            self.reach[new] = impulses.reach_of(row[new, 1].astype(np.intp), along[new])
             answers = np.einsum("ij,kj->ki", np.linalg.inv(impulses.H), self.reach[new])
             more += np.einsum("ik,jk->ij", self.reach[:count], answers)
         self.A[:count, new], self.A[new, :count] = more, more.T
         ends, nodes, shares = mass.entries()
         f.struck = count
-        contact._point(
+        contact.point(
             column=at.astype(np.intc), ends=ends.astype(np.intc), reached_nodes=nodes.astype(np.intc), shares=shares,
             starts=self._starts(),
         )  # fmt: skip
@@ -72,7 +100,7 @@ class Stops:
         self.A, self.reach = np.zeros((1, 1)), np.zeros((1, contact.f.n_s))
         self.grow(len(contact.W))
         if contact.f.feels:
-            contact._point(
+            contact.point(
                 X_hand=np.ascontiguousarray(impulses.X.T), H=np.ascontiguousarray(np.linalg.inv(impulses.H)),
                 GX=np.ascontiguousarray(total(contact.layout.comm, contact.system.G.T @ impulses.X)),
             )  # fmt: skip

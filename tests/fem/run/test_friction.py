@@ -110,22 +110,33 @@ def test_a_large_problem_is_left_to_friction_that_grows() -> None:
     assert pyramid_forces(np.eye(2 * k), np.ones(2 * k), np.ones(k), 1) is None
 
 
-@pytest.mark.parametrize("tangents", [2])
-def test_much_friction_is_found_from_little(tangents: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_much_friction_in_three_dimensions_is_found_from_little(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loads under which rounds and sweeps from no forces lead nowhere: a tenth of them, rounding decides which."""
-    grown, grow, refused = list[int](), Coulomb._grow, 0
+    grown, grow = list[int](), Coulomb._grow
     monkeypatch.setattr(Coulomb, "_grow", lambda *arguments: (grown.append(1), grow(*arguments))[1])
-    k, s, mu = 5, 1 + tangents, 10.0
+    k, mu = 5, 10.0
     for seed in range(100):
-        rng = np.random.default_rng(seed)
-        A = rng.standard_normal((s * k + 2, s * k))
-        W, q = A.T @ A / k + 0.1 * np.eye(s * k), rng.standard_normal(s * k)
-        try:
-            check_law(Coulomb(tangents).solve(k, W, q, np.full(k, mu), 1e-13), W, q, mu)
-        except SolverError:
-            refused += 1
-    assert len(grown) - refused >= 4  # 9 and 10 to 11 seen, with the kernels of two kinds of processors
-    assert refused <= 5  # 1 and 2 seen
+        W, q = strong_problem(seed, k, 0.1)
+        check_law(Coulomb(2).solve(k, W, q, np.full(k, mu), 1e-13), W, q, mu)
+    assert len(grown) >= 4  # 9 seen
+
+
+def strong_problem(seed: int, k: int, ridge: float) -> tuple[Any, Any]:
+    """W and q of k nodes in 3D whose rows are strongly coupled."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((3 * k + 2, 3 * k))
+    return A.T @ A / k + ridge * np.eye(3 * k), rng.standard_normal(3 * k)
+
+
+def test_in_three_dimensions_pyramids_lead_to_the_cone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loads under which friction that grows ends before mu, 26 of 360 seen; 2 of 1200 were refused then."""
+    monkeypatch.setattr(Coulomb, "_grow", lambda *_: False)
+    solved, pivot = list[bool](), Coulomb._pivot
+    monkeypatch.setattr(Coulomb, "_pivot", lambda *arguments: (solved.append(pivot(*arguments)), solved[-1])[1])
+    for seed, k, ridge, mu in [(0, 5, 0.1, 100.0), (6, 5, 0.1, 100.0), (3, 12, 0.02, 100.0), (6, 5, 0.02, 1e3)]:
+        W, q = strong_problem(seed, k, ridge)
+        check_law(Coulomb(2).solve(k, W, q, np.full(k, mu), 1e-13), W, q, mu)
+    assert any(solved)  # rounding decides in which
 
 
 def test_few_other_rows_leave_the_factor() -> None:
