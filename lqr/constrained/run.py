@@ -127,23 +127,23 @@ def run_inputs(
     surface: Surface,
     start: PlantState,
     target: Target,
-    steps: int,
+    inputs: Array,
+    dt: float,
 ) -> BodyRun:
-    """Run another plant, one of finite strain for example, under the inputs of a plan. Collective.
+    """Run a plant, one of finite strain for example, under given inputs, those of a plan for example. Collective.
 
     Args:
         solution: optimal feedback of the linear plant, and the cost that is still to come at the end.
         surface: nodes of the body on its boundary.
         start: state at t = 0.
         target: state of this plant at rest.
-        steps: of the midpoint rule, in each part of an interval.
+        inputs: of every step [N], (steps, n_s).
+        dt: time step [s].
 
     Raises SolverError: a solve failed.
     """
-    each = plan.horizon.plant.parts * steps
-    loop = ClosedLoop(watching(problem, surface), plan.horizon.plant.grid / each)
+    loop = ClosedLoop(watching(problem, surface), dt)
     try:
-        inputs = np.repeat(plan.inputs, each, axis=0)
         run = LoopRun(
             loop, OpenDrive(loop.plant, inputs), start, len(inputs), LoopOptions(), target_of(loop.problem, target)
         )

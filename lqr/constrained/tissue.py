@@ -28,6 +28,7 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
 
+UNDAMPED = 1e-300  # [1/s]: a decay that stands for none
 INDEPENDENT = 1e-8  # of a column: what the others leave of it is rounding below
 
 
@@ -42,6 +43,8 @@ class ModalTissue:
     seen: Array  # S, displacement of the nodes in each mode, (nodes, d, k)
     c: Array  # outputs of the modes, (p, k)
     of: Array | None = None  # of a reduced one, its shapes by the modes of the full one, (n, k)
+    same: NDArray[np.int64] | None = None  # of a reduced one, number of the same mode of the full one, else -1, (k,)
+    lowest: int | None = None  # number of modes where they are not all: static answers K^{-1} G follow them; else None
     hand: Array | None = None  # S_hand of a hand that feels the tissue, (n_s, k); else None
 
     @property
@@ -49,21 +52,31 @@ class ModalTissue:
         """Decay of every mode without feedback [1/s], (k,)."""
         return np.asarray((self.alpha + self.beta * self.omega**2) / 2)
 
-    def reduced(self, k: int) -> ModalTissue:
-        """K^{-1} G and modes in the order |c|^2 |g|^2 / (delta omega^2), as k modes of their own.
+    def reduced(self, k: int, grid: float) -> ModalTissue:
+        """K^{-1} G and the modes that the bound of what is left out would feel most, as k modes of their own.
 
-        The static shapes make the answer to a constant acceleration exact.
+        The static shapes make the answer to a constant acceleration exact. Modes come in the order
+        max_j |S_j| |g| / omega^2 (1 + |1 - e^{p grid}| / (1 - e^{-delta grid})), the l1 norm of an answer to pulses of
+        length ``grid`` [s] at the node that moves most.
 
         Raises ControlError: there are no k shapes.
         """
         n, n_s = self.g.shape
         if not n_s < k <= n:
             raise ControlError(f"a plan needs {n_s + 1} to {n} shapes of the tissue, not {k}")
-        shapes = static_and_modes(self.omega, self.delta, self.g, self.c, k)
+        slow = poles(self.omega, self.delta)[0]
+        passed = np.abs(1 - np.exp(slow * grid)) / -np.expm1(np.minimum(slow.real, -UNDAMPED) * grid)
+        lost = np.linalg.norm(self.seen, axis=1).max(axis=0) * np.linalg.norm(self.g, axis=1) * (1 + passed)
+        kept = np.sort(np.argsort((-lost / self.omega**2)[: self.lowest], kind="stable")[: k - n_s])
+        shapes = static_shapes(self.omega, self.g, kept)
         squares, T = np.linalg.eigh(shapes.T @ (self.omega[:, None] ** 2 * shapes))
-        V = shapes @ T
+        omega, V = np.concatenate([self.omega[kept], np.sqrt(squares)]), np.hstack([np.eye(n)[:, kept], shapes @ T])
+        order, same = np.argsort(omega, kind="stable"), np.append(kept, np.full(len(squares), -1))
+        V = V[:, order]
         hand = None if self.hand is None else self.hand @ V
-        return ModalTissue(np.sqrt(squares), self.alpha, self.beta, V.T @ self.g, self.seen @ V, self.c @ V, V, hand)
+        return ModalTissue(
+            omega[order], self.alpha, self.beta, V.T @ self.g, self.seen @ V, self.c @ V, V, same[order], None, hand
+        )
 
     @property
     def relative(self) -> Array:
@@ -75,9 +88,7 @@ class ModalTissue:
 
         ``a``: acceleration u - u_bar over M_s of every interval [m/s2], (H, n_s).
         """
-        root = np.sqrt((self.delta**2 - self.omega**2).astype(complex))
-        root = np.where(np.abs(root) < 1e-6 * self.omega, 1e-6 * self.omega, root)  # equal roots, moved by 1e-12
-        p, m = -self.delta + root, -self.delta - root
+        p, m, _ = poles(self.omega, self.delta)
         s = grid * np.arange(parts + 1)[:, None] / parts
         slow, fast = np.exp(p * s), np.exp(m * s)
         eta, rate = np.zeros(len(p)), np.zeros(len(p))
@@ -90,29 +101,34 @@ class ModalTissue:
         return result
 
 
-def static_and_modes(omega: Array, delta: Array, g: Array, c: Array, k: int) -> Array:
-    """K^{-1} G and modes in the order |c|^2 |g|^2 / (delta omega^2): k orthonormal columns of amplitudes, (n, k).
+def static_shapes(omega: Array, g: Array, kept: NDArray[np.int64]) -> Array:
+    """What modes leave of K^{-1} G: orthonormal columns of amplitudes, those of rounding left out, (n, <= n_s).
 
     Args:
         omega: natural frequencies [1/s], (n,).
-        delta: decay of the modes [1/s], (n,).
         g: coupling to the hand, (n, n_s).
-        c: outputs of the modes, (p, n).
-        k: number of columns, more than n_s.
+        kept: numbers of the modes.
     """
-    n, n_s = g.shape
-    decay = np.maximum(delta, np.finfo(float).tiny)
-    cost = np.sum(c**2, axis=0) * np.sum(g**2, axis=1) / (decay * omega**2)
-    order = np.argsort(-cost, kind="stable")
     static = g / omega[:, None] ** 2
-    shapes = np.linalg.qr(np.eye(n)[:, order[: k - n_s]])[0]
-    for column in (static / np.linalg.norm(static, axis=0)).T:  # those that the modes leave something of
+    static = static / np.linalg.norm(static, axis=0)
+    static[kept] = 0.0
+    shapes = np.zeros((len(omega), 0))
+    for column in static.T:
         for _ in range(2):
             column = column - shapes @ (shapes.T @ column)
         size = np.linalg.norm(column)
         if size > INDEPENDENT:
             shapes = np.column_stack([shapes, column / size])
-    return np.asarray(shapes)
+    return shapes
+
+
+def poles(omega: Array, delta: Array) -> tuple[np.ndarray, np.ndarray, NDArray[np.bool_]]:
+    """The roots p and m of every mode, p the slower one, and which modes are overdamped."""
+    gap = delta**2 - omega**2
+    # equal roots are moved apart by less than rounding sees
+    gap = np.where(np.abs(gap) < 1e-12 * omega**2, -1e-12 * omega**2, gap)
+    root = np.sqrt(gap.astype(complex))
+    return -delta + root, -delta - root, gap > 0
 
 
 @dataclass(frozen=True)
@@ -138,8 +154,7 @@ def make_surface(layout: BlockLayout, free: np.ndarray, held: np.ndarray) -> Sur
 def modal_tissue(problem: RiccatiProblem, surface: Surface, loop: ModalLoop | None = None) -> ModalTissue:
     """All modes of the tissue of a plant, of ``loop`` where they are known. Collective.
 
-    Raises ControlError: the hand hears the tissue, the damping couples modes or drags in space, or there are too many
-    unknowns.
+    Raises ControlError: the plant has no plan, see :func:`require_plannable`.
     """
     system, layout = problem.system, problem.layout
     d = layout.dimension
@@ -157,7 +172,7 @@ def _about_centre(problem: RiccatiProblem, tissue: ModalTissue) -> ModalTissue:
     squares, V = scipy.linalg.eigh(np.diag(tissue.omega**2), np.eye(len(tissue.omega)) - tissue.g @ moved)
     hand = -moved @ V
     seen, c = tissue.seen @ V + hand, tissue.c @ V + problem.C_s @ hand
-    return ModalTissue(np.sqrt(squares), 0.0, tissue.beta, V.T @ tissue.g, seen, c, None, hand)
+    return ModalTissue(np.sqrt(squares), 0.0, tissue.beta, V.T @ tissue.g, seen, c, hand=hand)
 
 
 def require_plannable(problem: RiccatiProblem) -> None:
@@ -182,6 +197,4 @@ def _not_planned(problem: RiccatiProblem) -> str:
         return "tissue under gravity alone; leave out the terms that add a load"
     if system.damping.matrix is not None or system.damping.drag:
         return "damping that is the same in all layers and acts against the hand"
-    if layout.n_e > DENSE_LIMIT:
-        return f"at most {DENSE_LIMIT} unknowns, all of whose modes enter the bound; this scene has {layout.n_e}"
     return ""

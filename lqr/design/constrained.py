@@ -18,6 +18,7 @@ from softgrasp.lqr.constrained.horizon import held_plant
 from softgrasp.lqr.constrained.online import Ticks, carried_ticks, make_program
 from softgrasp.lqr.constrained.plan import Plan, make_plan
 from softgrasp.lqr.constrained.pulse import PulseError
+from softgrasp.lqr.constrained.rest import known_tissue, run_rest
 from softgrasp.lqr.constrained.rows import Limits
 from softgrasp.lqr.constrained.run import STEPS, PlanRuns, run_inputs, run_plan
 from softgrasp.lqr.constrained.task import Task
@@ -36,6 +37,7 @@ from softgrasp.lqr.spectrum.sampled import Sampling
 
 if TYPE_CHECKING:  # observers are not imported where a scene has none
     from softgrasp.lqr.design.observer import ObservedControl
+    from softgrasp.lqr.observer.tube import TubeTrajectory
 
 FINITE_STEPS = 5  # of a run of finite strain in each part of an interval: 25 ms at the defaults
 SETTLED = 5.0  # time constants of the hand alone that the first horizon lasts: 0.7 % of the way are left
@@ -59,6 +61,8 @@ class PlannedControl:
     """The controller that plans again at every interval, on the full plant; None where there is none."""
     reason: str = ""
     """Why there is no such controller; empty where there is one."""
+    run_error: float | None = None
+    """Part of the margin for the steps of the runs behind it, proved [m]; None where all modes are known."""
 
 
 @dataclass(frozen=True)
@@ -110,14 +114,15 @@ def run_plan_finite(design: Design, model: Model, planned: PlannedControl) -> Fi
     """
     problem, target = finite_problem(design.problem, model.system, design.target)
     start = rest(model.system, deformed=model.scene.time.start == "equilibrium")
+    plan, surface = planned.plan, planned.surface
+    each = plan.horizon.plant.parts * FINITE_STEPS
+    inputs, dt = np.repeat(plan.inputs, each, axis=0), plan.horizon.plant.grid / each
     try:
-        run = run_inputs(problem, design.solution, planned.plan, planned.surface, start, target, FINITE_STEPS)
+        run = run_inputs(problem, design.solution, plan, surface, start, target, inputs, dt)
     except SolverError as error:  # it diverges, or leaves what the law describes
         return FinitePlan(np.zeros(0), np.inf, str(error))
     # with the same steps, whose error is that of both
-    linear = run_inputs(
-        design.problem, design.solution, planned.plan, planned.surface, design.start, design.target, FINITE_STEPS
-    )
+    linear = run_inputs(design.problem, design.solution, plan, surface, design.start, design.target, inputs, dt)
     return FinitePlan(run.least, float(np.linalg.norm(run.body - linear.body, axis=2).max()))
 
 
@@ -148,29 +153,36 @@ def plan_control(
     obstacles = make_obstacles(design.model.scene, plant.layout.dimension)
     given = control_of(design.model).constraints
     assert given is not None
-    surface = _surface(design.model)
+    surface, whole = _surface(design.model), plant.layout.n_e <= DENSE_LIMIT
     start = _at_rest(design)
     with watch.stage("bound"):
         require_plan(design.model)
-        loop = ModalLoop(plant, DENSE_LIMIT) if observed is None else observed.loop
-        tissue = modal_tissue(plant, surface, loop)
-        reduced = tissue.reduced(given.N // 2 - plant.layout.n_s)
+        loop = observed.loop if observed is not None else ModalLoop(plant, DENSE_LIMIT if whole else None)
+        if whole:
+            tissue, shapes = modal_tissue(plant, surface, loop), loop.plant.Phi
+        else:
+            tissue, shapes = known_tissue(plant, surface)
+        reduced = tissue.reduced(given.N // 2 - plant.layout.n_s, given.grid)
         limits = _limits(design)
+        run_error = None if whole else 0.0
         error = np.full(surface.nodes.shape, 0.0 if given.margin == "bound" else given.margin)
         if given.margin == "bound":
             most = np.abs(np.linalg.inv(plant.M_s)) @ (_force(limits) + np.abs(design.target.u))
-            pulses = PulseError(tissue, reduced, given.grid)
+            rest_of = None if whole else run_rest(plant, surface, tissue, shapes, given.grid)
+            if rest_of is not None:
+                run_error = max(float((rest_of.error(i) @ most).max()) for i in range(len(rest_of.instants)))
+            pulses = PulseError(tissue, reduced, given.grid, rest_of)
             error = on_root(plant.layout.comm, lambda: pulses.bound(most))
         noise, limits = _noise(given.noise, observed, tissue, limits)
     with watch.stage("plan"):
         on_grid = held_plant(plant, reduced, given.grid, given.parts)
         begin = np.zeros(on_grid.N)
         begin[: plant.layout.n_s] = start
-        shapes, names = tuple(o.shape for o in obstacles), tuple(o.name for o in obstacles)
+        bodies, names = tuple(o.shape for o in obstacles), tuple(o.name for o in obstacles)
         penalty = None if given.penalty == "auto" else float(given.penalty)
         target = _places(plant, surface, design)
         task = Task(
-            begin, target, design.target.u, shapes, names, error, given.clearance + estimated, limits, noise,
+            begin, target, design.target.u, bodies, names, error, given.clearance + estimated, limits, noise,
             given.margin == "bound", penalty, tuple(o.path for o in obstacles),
         )  # fmt: skip
         steps = first_horizon(design.model, plant)
@@ -179,10 +191,10 @@ def plan_control(
     with watch.stage("plan run"):
         runs = run_plan(plant, design.solution, plan, surface, tissue, design.start, design.target, notify)
     if not online:
-        return PlannedControl(plan, runs, surface, names)
+        return PlannedControl(plan, runs, surface, names, run_error=run_error)
     with watch.stage("online"):
-        robot, reason = _online(design, plan, tissue, loop, observed)
-    return PlannedControl(plan, runs, surface, names, robot, reason)
+        robot, reason = _online(design, plan, _Known(surface, tissue, shapes, loop), observed)
+    return PlannedControl(plan, runs, surface, names, robot, reason, run_error)
 
 
 def _noise(
@@ -210,10 +222,20 @@ def _noise(
     return deviations * sd, limits
 
 
+@dataclass(frozen=True)
+class _Known:
+    """The tissue as the bound has it."""
+
+    surface: Surface  # nodes of the boundary
+    tissue: ModalTissue  # all modes, or the lowest with static answers
+    shapes: Array  # of them, local rows
+    loop: ModalLoop  # the plant in all modes, or in the lowest
+
+
 def planned_controller(
     design: Design,
     plan: Plan,
-    modes: ModalLoop,
+    shapes: Array,
     observed: ObservedControl | None = None,
     rate: float | None = None,
 ) -> Controller:
@@ -223,7 +245,7 @@ def planned_controller(
 
     Args:
         design: the optimal feedback, which keeps the plant near to the plan.
-        modes: all modes of the plant.
+        shapes: of the tissue that the plan's plant was reduced from, local rows.
         observed: observer of the scene; None: the tissue is carried from the measured hand.
         rate: ticks a second without an observer; None: those of the scene.
 
@@ -234,11 +256,11 @@ def planned_controller(
     own = plan.horizon.plant.tissue.of
     assert own is not None
     if observed is None:
-        plant, shapes = galerkin(problem, modes.plant.Phi @ own)
+        plant, small = galerkin(problem, shapes @ own)
         x_bar, u_bar = plant.rest_at(design.target.state.q_s)
         period = 1 / (rate or control_of(design.model).loop.rate)
         base = Controller(
-            shapes.reduce_gain(problem, design.gain), x_bar, u_bar, plant, period,
+            small.reduce_gain(problem, design.gain), x_bar, u_bar, plant, period,
             None, scene_hash(design.model.scene), layout_hash(problem.layout),
             {"scene": design.model.scene.name, "method": "optimal gain around a plan", "N": plant.N},
         )  # fmt: skip
@@ -258,7 +280,7 @@ def planned_controller(
 
 
 def _online(
-    design: Design, plan: Plan, tissue: ModalTissue, modes: ModalLoop, observed: ObservedControl | None
+    design: Design, plan: Plan, known: _Known, observed: ObservedControl | None
 ) -> tuple[PlannedOnline | None, str]:
     """The planned controller on the full plant for the horizon, or why there is none. Collective."""
     from softgrasp.lqr.observer.judge import make_ticks
@@ -269,7 +291,7 @@ def _online(
     if problem.system.two_way:
         return None, "the hand feels the tissue; a plan is made again online for one that does not"
     try:
-        controller = planned_controller(design, plan, modes, observed)
+        controller = planned_controller(design, plan, known.shapes, observed)
     except ControlError as error:
         return None, str(error)
     runs = controller
@@ -278,24 +300,32 @@ def _online(
             plan.horizon.plant.parts * STEPS / plan.horizon.plant.grid
         )  # ticks a second: between them nothing happens
         if slow < 1 / controller.period:
-            runs = planned_controller(design, plan, modes, rate=slow)
+            runs = planned_controller(design, plan, known.shapes, rate=slow)
         sensors, nothing = make_sensors(problem, [], Noise(0.0, 0.0)), make_disturbance(problem, 0.0, 0.0, None)
-        ticks = make_ticks(problem, modes, sensors, nothing, runs.period)
+        ticks = make_ticks(problem, known.loop, sensors, nothing, runs.period)
     else:
         ticks = observed.ticks
 
-    def run() -> PlannedOnline:
+    whole = known.loop.complete
+
+    def run() -> tuple[TubeTrajectory, Array | None]:
         plant, program = plan.horizon.plant, runs.planner
         assert program is not None
-        rows = node_rows(tissue, plant.n_s)
+        # a hand that feels no tissue moves the same in any modes; the full plant follows below
+        rows = node_rows(known.tissue, plant.n_s) if whole else np.zeros((0, plant.n_s, len(ticks.A)))
         every = max(1, program.every // (plant.parts * STEPS))
         count = plan.horizon.steps * program.every
         found = run_tube(runs, ticks, rows, count, every, None if observed is None else 0)
-        gaps = plan.task.gaps(plan.task.places + found.moved, found.times)
-        covariance = None if observed is None else node_covariance(rows, observed.judged)
-        return PlannedOnline(controller, covariance, found.times, gaps, found.log)
+        return found, None if observed is None else node_covariance(rows, observed.judged)
 
-    return on_root(problem.layout.comm, run), ""
+    found, covariance = on_root(problem.layout.comm, run)
+    if not whole:
+        body = run_inputs(
+            problem, design.solution, plan, known.surface, design.start, design.target, found.inputs, runs.period
+        )
+        return PlannedOnline(controller, None, body.times, body.gaps, found.log), ""
+    gaps = on_root(problem.layout.comm, lambda: plan.task.gaps(plan.task.places + found.moved, found.times))
+    return PlannedOnline(controller, covariance, found.times, gaps, found.log), ""
 
 
 def require_plan(model: Model) -> None:

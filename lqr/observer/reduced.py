@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.fem.reduced import ReducedSystem
-from softgrasp.lqr.constrained.tissue import static_and_modes
+from softgrasp.lqr.constrained.tissue import static_shapes
 from softgrasp.lqr.dense.modal import ModalPlant
 from softgrasp.lqr.loop.filter import Filter
 from softgrasp.lqr.loop.small import Shapes, galerkin
@@ -65,7 +66,8 @@ def reduced_filter(
     delta = np.diag(modes.D) / 2
     if not delta.min() > 0:
         raise ControlError(f"the mode at {modes.omega[int(delta.argmin())]:.4g}/s has no damping; an observer needs it")
-    mixed = static_and_modes(modes.omega, delta, modes.g, modes.c, k)
+    kept = kept_modes(modes, k - n_s)
+    mixed = np.hstack([np.eye(n)[:, kept], static_shapes(modes.omega, modes.g, kept)])
     plant, shapes = galerkin(problem, modes.Phi @ mixed)
     seen, moved = (total(comm, part) for part in sensors.of(modes.Phi))
     C = np.hstack([sensors.C.hand.T, seen @ mixed, moved @ mixed])
@@ -79,6 +81,12 @@ def reduced_filter(
     A, B, f, P, M = on_root(comm, lambda: _stationary(plant, C, noise, V, period))
     own = Filter(A, B, f, C, M, sensors.names, sensors.speed, delay)
     return ReducedFilter(own, plant, shapes, V, left / period, P, mixed)
+
+
+def kept_modes(modes: ModalPlant, count: int) -> NDArray[np.int64]:
+    """The modes of largest |c|^2 |g|^2 / (delta omega^2), what each adds to the cost."""
+    cost = np.sum(modes.c**2, axis=0) * np.sum(modes.g**2, axis=1) / (np.diag(modes.D) / 2 * modes.omega**2)
+    return np.argsort(-cost, kind="stable")[:count]
 
 
 def _stationary(plant: ReducedSystem, C: Array, noise: Array, V: Array, period: float) -> tuple[Array, ...]:

@@ -80,10 +80,10 @@ class TailBound:
         self.parts = np.hsplit(size, 3)  # gain on z and v, and force, of each mode
         self.modes = np.linalg.norm(np.stack(self.parts), axis=2)
         # the rest itself: as a difference of norms it would lose half the digits
-        rest = columns - _schur_mass(problem, Phi) @ size
+        rest = columns - schur_mass(problem, Phi) @ size
         self.rest_z, self.rest_v, self.rest_force = _norms(problem, rest, _inverse_schur_mass(problem, rest), 3)
         static = static_columns(system, rest[:, 2 * n_s :])
-        (self.rest_static,) = _norms(problem, static, _schur_mass(problem, static), 1)
+        (self.rest_static,) = _norms(problem, static, schur_mass(problem, static), 1)
 
     def bound(self, r: float, a: float = 0.0) -> float:
         """The bound at radius r for Re s >= -a, 0 <= a < r; infinite where no bound is known."""
@@ -135,7 +135,7 @@ def _norms(problem: RiccatiProblem, X: Array, W_X: Array, parts: int) -> list[fl
     return [float(np.sqrt(max(part.sum(), 0.0))) for part in np.split(squares, parts)]
 
 
-def _schur_mass(problem: RiccatiProblem, X: Array) -> Array:
+def schur_mass(problem: RiccatiProblem, X: Array) -> Array:
     """M_ee X, two-way (M_ee - G M_s^{-1} G') X: the mass with the free hand eliminated; local rows. Collective."""
     system = problem.system
     result = times_columns(system.M_ee, X)

@@ -84,11 +84,11 @@ def facts(study: PlannedStudy) -> list[tuple[str, str]]:
         rows += [
             (
                 "margin for the reduced plant",
-                f"{task.error.max():.3g} m, its error in this plan {runs.reduction_error:.2g} m",
+                f"{task.error.max():.3g} m, its error in this plan {runs.reduction_error:.2g} m{_behind(study)}",
             ),
             ("margin between two instants", f"{plan.bend:.2g} m where a gap is active"),
             ("clearance", f"{task.clearance - study.margin_finite:.3g} m"),
-            ("error of the run's own step", f"{runs.step_error:.2g} m, measured against the exact modes"),
+            ("error of the run's own step", f"{runs.step_error:.2g} m, measured against {_modes(study)}"),
             ("cost of a metre of one gap at one instant", f"{plan.multiplier:.3g} at most"),
         ]
     rows += _noisy(study)
@@ -158,6 +158,19 @@ def _finite(finite: FinitePlan) -> str:
     least = float(finite.gaps.min(initial=np.inf))
     kept = "every gap is kept" if least >= 0 else f"a gap is exceeded by {-least:.2g} m"
     return f"{kept}; the linear plant errs by up to {finite.error:.2g} m, an estimate of the clearance to give"
+
+
+def _modes(study: PlannedStudy) -> str:
+    whole = study.planned.run_error is None
+    return "the exact modes" if whole else "the lowest modes and the static answer"
+
+
+def _behind(study: PlannedStudy) -> str:
+    """Of a margin from runs: the part that their own steps have in it."""
+    part = study.planned.run_error
+    return (
+        "" if part is None else f"; runs of the full plant are behind it, whose own steps err by {part:.1g} m at most"
+    )
 
 
 def _held(plan: Plan) -> str:

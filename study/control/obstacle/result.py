@@ -73,6 +73,7 @@ class PlannedStudy:
             },
             **({"gap_min_noisy": online.gaps.min(axis=0).tolist()} if noisy and online is not None else {}),
             "online": self._online(),
+            **({} if self.planned.run_error is None else {"error_of_pulse_runs": self.planned.run_error}),
             "error_of_reduced_plant": runs.reduction_error,
             "error_of_run_step": runs.step_error,
             **({} if self.finite is None else {"finite_strain": _finite(self.finite)}),
