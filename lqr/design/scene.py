@@ -121,3 +121,18 @@ def with_control(model: Model) -> tuple[Model, str]:
     control = Control(outputs=outputs)
     note = f"the scene has no [control] table: {what} as output, Q = R = 1"
     return replace(model, scene=model.scene.model_copy(update={"control": control})), note
+
+
+def given_force(model: Model, n_s: int) -> Array | None:
+    """Largest force on the hand of the scene, one number per axis. Raises ControlError: their number does not fit."""
+    given = control_of(model).constraints
+    assert given is not None
+    if given.force is None and given.margin == "bound":
+        raise ControlError(
+            "control.constraints.force is missing; the bound of the reduced plant needs it, or give "
+            "control.constraints.margin in metres"
+        )
+    force = None if given.force is None else np.atleast_1d(np.asarray(given.force, dtype=np.float64))
+    if force is not None and len(force) not in (1, n_s):
+        raise ControlError(f"control.constraints.force has {len(force)} numbers; give one, or {n_s}, one per axis")
+    return None if force is None else np.broadcast_to(force, (n_s,)).copy()
