@@ -12,8 +12,6 @@ from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from softgrasp.fem.errors import MeshError
 from softgrasp.fem.shown import counted
@@ -84,8 +82,10 @@ def check_cells(points: Floats, cells: Integers, repair: bool, name: str) -> Int
 
 def linked(one: Integers, other: Integers, n: int) -> tuple[int, Ints]:
     """Number of the connected components of n items with these links, and the component of each item."""
+    from scipy.sparse import coo_array, csgraph  # slow to import, and for mesh files alone
+
     graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
-    count, labels = connected_components(graph.tocsr(), directed=False)
+    count, labels = csgraph.connected_components(graph.tocsr(), directed=False)
     return count, labels
 
 

@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq
 
 from softgrasp.fem.mesh.check import Flags, Floats, Integers, sort_facets
 
@@ -78,6 +77,8 @@ def exponent(angle: float, nu: float, held: int) -> float:
         return _mixed(angle, kappa, s)
     if angle <= np.pi:  # nothing is singular there
         return 1.0
+    from scipy.optimize import brentq  # slow to import, and few bodies have such a corner
+
     best, grid = 1.0, np.linspace(0.05, 1 - 1e-9, 400)
     for factor in (s, -s) if held == 0 else (s / kappa, -s / kappa):
 

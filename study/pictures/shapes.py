@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from contourpy import contour_generator
 from PIL import Image, ImageDraw, ImageFilter
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from softgrasp.fem import Array, PictureMesh
 
@@ -197,10 +195,12 @@ def _boxes_overlap(low: Array, high: Array) -> bool:
 
 def _pieces(facets: Any, n: int) -> list[Any]:
     """Vertices of each connected piece of a set of facets."""
+    from scipy.sparse import coo_array, csgraph  # slow to import, and not for every hand
+
     used = np.unique(facets)
     ends = np.searchsorted(used, facets)
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(used), len(used)))
-    count, label = connected_components(graph, directed=False)
+    count, label = csgraph.connected_components(graph, directed=False)
     return [used[label == i] for i in range(count)]
 
 
