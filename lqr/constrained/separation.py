@@ -18,6 +18,8 @@ from softgrasp.lqr.program.least_distance import InfeasibleError, nearest
 
 UPRIGHT = 1e-6  # sine of the angle from the vertical below which a way is vertical
 UP = np.array([0.0, 0.0, 1.0])
+ROUNDS = 20  # of the search for sides; a few are enough for hulls apart
+TOUCH = 1e-15  # of the square of a length: rounding
 
 
 def supports(shape: Shape, normals: Array) -> Array:
@@ -55,6 +57,58 @@ def _separate_plane(shape: Ball | Polytope, corners: Array, body: Array) -> tupl
     gaps = (every @ hull.T).min(axis=1) - supports(shape, every)
     best = int(np.argmax(gaps))
     return every[best], float(gaps[best])
+
+
+def gaps(shape: Shape, bodies: Array) -> Array:
+    """The gap of `separate` for many bodies (count, b, d), (count,) [m].
+
+    Those apart in the plane are found together: from a side p q of points of the hull of the differences y - o, the
+    nearest point x to the origin on it, and the point s of the hull farthest against x, until x.s = x.x [GJK88].
+    """
+    if isinstance(shape, HalfSpace):
+        return np.asarray((bodies @ shape.normal).min(axis=1) - shape.offset)
+    assert isinstance(shape, Ball | Polytope)
+    found, open_ = np.empty(len(bodies)), np.ones(len(bodies), dtype=bool)
+    if bodies.shape[2] == 2:
+        corners = shape.corners if isinstance(shape, Polytope) else shape.center[None, :]
+        distance, open_ = _distances(bodies, corners)
+        found = distance - (shape.radius if isinstance(shape, Ball) else 0.0)
+    for t in np.flatnonzero(open_):
+        found[t] = separate(shape, bodies[t])[1]
+    return found
+
+
+def _distances(bodies: Array, corners: Array) -> tuple[Array, Array]:
+    """Distances of hulls in the plane (count,) [m], and which of them are not found, for they overlap or touch."""
+    count = np.arange(len(bodies))
+
+    def farthest(x: Array) -> Array:
+        """The point y - o with the least x.(y - o), (count, 2)."""
+        nearest_corner = corners[(x @ corners.T).argmax(axis=1)]
+        return np.asarray(bodies[count, np.einsum("tjd,td->tj", bodies, x).argmin(axis=1)] - nearest_corner)
+
+    p = q = x = bodies[:, 0] - corners[0]
+    for _ in range(ROUNDS):
+        s = farthest(x)
+        ends = _on_side(p, s), _on_side(q, s)
+        first = (ends[0] ** 2).sum(axis=1) <= (ends[1] ** 2).sum(axis=1)
+        closer = np.where(first[:, None], *ends)
+        left = (x * x).sum(axis=1) - (x * s).sum(axis=1) > TOUCH * (s * s).sum(axis=1)
+        p, q = np.where(left[:, None], np.where(first[:, None], p, q), p), np.where(left[:, None], s, q)
+        x = np.where(left[:, None], closer, x)
+        if not left.any():
+            break
+    size = np.linalg.norm(x, axis=1)
+    low = (x * farthest(x)).sum(axis=1)  # size * distance from below, where it is size itself from above
+    return size, np.asarray(low < size**2 - 1e-12 * size * np.abs(bodies).max())
+
+
+def _on_side(p: Array, s: Array) -> Array:
+    """Nearest point to the origin on the lines between p and s, (count, 2)."""
+    along = s - p
+    length = (along * along).sum(axis=1)
+    part = np.clip(-(p * along).sum(axis=1) / np.where(length > 0, length, 1.0), 0.0, 1.0)
+    return np.asarray(p + part[:, None] * along)
 
 
 def _apart(points: Array) -> Array:

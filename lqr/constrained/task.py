@@ -12,7 +12,7 @@ from softgrasp.fem.obstacles.shapes import Shape
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.constrained.horizon import HeldPlant, Horizon
 from softgrasp.lqr.constrained.rows import Limits
-from softgrasp.lqr.constrained.separation import separate, supports
+from softgrasp.lqr.constrained.separation import gaps, separate, supports
 from softgrasp.lqr.plant.checks import ControlError
 
 
@@ -50,9 +50,9 @@ class Task:
 
     def gaps(self, body: Array, times: Array) -> Array:
         """Gap of the body (count, nodes, d) to every obstacle at times [s], (count, obstacles) [m]."""
-        count = range(len(self.shapes))
-        every = [[self.separate(i, at, t)[1] for i in count] for at, t in zip(body, times.tolist(), strict=True)]
-        return np.array(every).reshape(len(body), -1)
+        shapes = enumerate(self.shapes)
+        every = [gaps(shape, body - self.shifts(i, times)[:, None]) for i, shape in shapes]
+        return np.array(every).reshape(-1, len(body)).T
 
 
 def after_paths(plant: HeldPlant, task: Task, steps: int, longest: int) -> int:

@@ -17,7 +17,7 @@ from softgrasp.lqr.constrained import online
 from softgrasp.lqr.constrained.horizon import Horizon
 from softgrasp.lqr.constrained.online import Ticks, make_program
 from softgrasp.lqr.constrained.plan import Plan
-from softgrasp.lqr.constrained.separation import separate
+from softgrasp.lqr.constrained.separation import gaps, separate
 from softgrasp.lqr.design.constrained import PlannedControl, plan_control
 from softgrasp.lqr.design.feedback import design
 from softgrasp.lqr.loop.controller import Controller
@@ -75,7 +75,7 @@ def kept(plan: Plan, x: np.ndarray, c: np.ndarray) -> float:
     longer = np.concatenate([c.ravel(), np.zeros(3 * c.size)])
     body = task.places + np.einsum("jdn,kin->kijd", horizon.plant.Y, horizon.state(x, longer))
     every = body.reshape(-1, *task.places.shape)
-    least = [min(separate(shape, at)[1] for at in every) for shape in task.shapes]
+    least = [gaps(shape, every).min() for shape in task.shapes]
     return float(min(least)) - task.clearance
 
 

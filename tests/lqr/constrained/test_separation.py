@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from softgrasp.fem.obstacles.shapes import Ball, HalfSpace, Polytope, Shape
-from softgrasp.lqr.constrained.separation import past, separate, supports
+from softgrasp.lqr.constrained.separation import gaps, past, separate, supports
 
 FAN = np.column_stack([f(np.linspace(0, 2 * np.pi, 20_000)) for f in (np.cos, np.sin)])
 
@@ -25,6 +25,19 @@ def test_gap_is_the_best_of_all_directions(shape: Shape) -> None:
         assert scanned <= gap + 1e-12  # rounding
         assert gap <= scanned + 1e-3  # the fan is 3e-4 rad wide
         assert np.isclose((body @ normal).min() - shape.support(normal), gap, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [Ball(np.array([0.3, 0.2]), 0.4), Polytope.box(np.zeros(2), np.array([0.5, 1.0]))])
+def test_gaps_of_many_bodies_are_those_of_each(shape: Shape) -> None:
+    rng = np.random.default_rng(0)
+    bodies = rng.uniform(-2, 2, (300, 1, 2)) + 0.6 * rng.standard_normal((300, 12, 2))
+    bodies[:20] = bodies[:20, :1]  # single points
+    bodies[20] += shape.support(np.array([1.0, 0.0])) - bodies[20, :, 0].min()  # one that touches
+    one_by_one = np.array([separate(shape, body)[1] for body in bodies[20:]])
+    assert np.abs(gaps(shape, bodies[20:]) - one_by_one).max() < 1e-14  # rounding of lengths of some metres
+    points = np.array([separate(shape, body[:1])[1] for body in bodies[:20]])
+    assert np.abs(gaps(shape, bodies[:20])[points > 0] - points[points > 0]).max() < 1e-14
+    assert 20 < (one_by_one < 0).sum() < 250  # both cases are met
 
 
 def test_half_space_has_its_own_normal() -> None:

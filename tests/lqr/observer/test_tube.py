@@ -11,7 +11,7 @@ import pytest
 from softgrasp.fem.model.build import Stopwatch, build
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.constrained.plan import make_plan
-from softgrasp.lqr.constrained.separation import separate
+from softgrasp.lqr.constrained.separation import gaps as apart
 from softgrasp.lqr.constrained.tissue import modal_tissue
 from softgrasp.lqr.design.constrained import PlannedControl, plan_control
 from softgrasp.lqr.design.feedback import design
@@ -42,7 +42,7 @@ def robot(found: PlannedControl) -> Controller:
 
 def gaps(found: PlannedControl, moved: np.ndarray) -> np.ndarray:
     task = found.plan.task
-    return np.array([[separate(shape, task.places + at)[1] for shape in task.shapes] for at in moved])
+    return np.array([apart(shape, task.places + moved) for shape in task.shapes])
 
 
 def test_without_noise_the_tube_follows_the_plan() -> None:
