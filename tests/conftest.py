@@ -87,8 +87,15 @@ def pytest_configure(config: pytest.Config) -> None:
         reporter._tw._file = open(os.devnull, "w")  # noqa: SIM115  (lives as long as the process)
 
 
-def _named(mark: pytest.Mark) -> int:
-    """Most ranks that a mark ``ranks`` names: 3 where it names none."""
+def _named(item: pytest.Item) -> int | None:
+    """Most ranks that the mark ``ranks`` of a test names, 3 where it names none; None where it leaves the test out."""
+    mark = item.get_closest_marker("ranks")
+    if mark is None:
+        return None
+    given = getattr(getattr(item, "callspec", None), "params", {})
+    for name, wanted in mark.kwargs.items():
+        if given[name] not in (wanted if isinstance(wanted, tuple) else (wanted,)):
+            return None
     return int(mark.args[0]) if mark.args else 3
 
 
@@ -97,21 +104,18 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     own = config.option.own_ranks
     if not collection_path.name.startswith("test_") or not (OWN.size > 2 or own or "ranks" in config.option.markexpr):
         return None
-    named = [int(n or 3) for n in re.findall(r"\bmark\.ranks\b(?:\((\d)\))?", collection_path.read_text())]
+    named = [int(n or 3) for n in re.findall(r"\bmark\.ranks\b(?:\((\d))?", collection_path.read_text())]
     return not any(n == OWN.size if own else n >= OWN.size for n in named) or None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Most ranks of a test: 1 where marked serial, 3 where marked ranks, n where ranks(n); else 2, and 1 above lqr."""
     if config.option.own_ranks:
-        found = [item for item in items if (mark := item.get_closest_marker("ranks")) and _named(mark) == OWN.size]
+        found = [item for item in items if _named(item) == OWN.size]
         config.hook.pytest_deselected(items=[item for item in items if item not in set(found)])
         items[:] = found
     for item in items:
-        mark = item.get_closest_marker("ranks")
-        most = 1 if SERIAL & set(item.path.relative_to(item.config.rootpath).parts) else 2
-        if mark is not None:
-            most = _named(mark)
+        most = _named(item) or (1 if SERIAL & set(item.path.relative_to(item.config.rootpath).parts) else 2)
         if item.get_closest_marker("serial"):
             most = 1
         if OWN.size > most:

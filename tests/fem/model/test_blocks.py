@@ -48,7 +48,7 @@ def test_the_paper_has_these_sizes(comm: MPI.Intracomm, cells: list[int], states
     assert build(scene, comm=comm).system.layout.states == states
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(columns=(1, 8))
 @pytest.mark.parametrize("entries", [1, 10**6])
 @pytest.mark.parametrize("storage", ["C", "F"])
 @pytest.mark.parametrize("columns", [1, 2, 3, 7, 8, 21])

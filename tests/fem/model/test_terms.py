@@ -194,7 +194,8 @@ def test_dashpots_in_all_the_body_are_rayleigh_damping(case):
     assert own.dissipated[-1] > 0
 
 
-@pytest.mark.parametrize("start", on_ranks("equilibrium", alone=["rest"]))
+@pytest.mark.ranks(start="equilibrium", case=("two-way", "finite strain", "cg"))
+@pytest.mark.parametrize("start", ["equilibrium", "rest"])
 @pytest.mark.parametrize("case", list(EFFECTS))
 def test_an_own_load_of_all_the_body_is_its_weight(case, start):
     """Equilibrium, reaction, work and damping of a load are those of gravity, whose code is another."""

@@ -51,7 +51,7 @@ def last(model: Model, run: Trajectory) -> Any:
     return gather_rows(model.system.layout, run.final[: model.system.layout.n_local])
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(law="neo-hooke")
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(
     "changes",
@@ -126,8 +126,8 @@ def test_pushed_hand_gains_the_momentum_of_the_force(effects: dict[str, Any]) ->
 @pytest.mark.ranks
 @pytest.mark.parametrize("solver", ["cholesky", "mumps", "cg"])
 def test_ranks_and_solvers_agree(solver: str) -> None:
-    """To the tolerance of the steps, over 30 of them; the spread factor of MUMPS and CG share the points by rank."""
-    few = {"time": {"steps": 30}, "motion": {"target": [2.0, 1.0]}}
+    """To the tolerance of the steps, over 10 of them; the spread factor of MUMPS and CG share the points by rank."""
+    few = {"time": {"steps": 10, "end": 0.5}, "motion": {"target": [2.0, 1.0]}}
     alone = finite(few, tol=1e-11, comm=MPI.COMM_SELF)
     model = finite(few, tol=1e-11, time={"solver": solver, "reproducible": False, "rtol": 1e-12})
     assert close(last(model, simulate(model)), last(alone, simulate(alone))) < 1e-8

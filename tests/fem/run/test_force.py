@@ -55,6 +55,7 @@ def pushed(
     return run, led(one, run), np.array(u)
 
 
+@pytest.mark.ranks(rotation=True)
 @pytest.mark.parametrize("rotation", [False, True])
 @pytest.mark.parametrize("name", CASES)
 def test_a_motion_takes_the_force_that_made_it(comm: MPI.Intracomm, name: str, rotation: bool) -> None:
@@ -66,6 +67,7 @@ def test_a_motion_takes_the_force_that_made_it(comm: MPI.Intracomm, name: str, r
     assert same_everywhere(comm, again.force)
 
 
+@pytest.mark.ranks(name=("dragged, weighing", "3d"))
 @pytest.mark.parametrize("name", ["bare", "viscous", "relative", "dragged, weighing", "3d"])
 def test_the_force_is_known_at_finite_strain(comm: MPI.Intracomm, name: str) -> None:
     """Steps to a tolerance of 1e-12; their first solutions part by what is left of a residual."""
@@ -76,6 +78,7 @@ def test_the_force_is_known_at_finite_strain(comm: MPI.Intracomm, name: str) -> 
     assert close(again.force, u) < SAME_RUN
 
 
+@pytest.mark.ranks(reaction=True)
 @pytest.mark.parametrize("reaction", [False, True])
 @pytest.mark.parametrize("damping", [{}, RAYLEIGH, DRAGGED], ids=["undamped", "rayleigh", "dragged"])
 def test_force_that_a_prescribed_motion_takes(comm: MPI.Intracomm, damping: dict[str, Any], reaction: bool) -> None:

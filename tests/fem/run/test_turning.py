@@ -270,7 +270,9 @@ def test_a_fast_hand_changes_its_momentum_by_the_load() -> None:
 @pytest.mark.parametrize("solver", ["cholesky", "mumps"])
 @pytest.mark.ranks
 def test_any_number_of_ranks(comm: MPI.Intracomm, solver: str) -> None:
-    keys = {"time": {"solver": solver, "reproducible": solver == "cholesky", "steps": 30, "end": 0.1, "start": "rest"}}
+    keys = {
+        "time": {"solver": solver, "reproducible": solver == "cholesky", "steps": 10, "end": 0.1 / 3, "start": "rest"}
+    }
     runs = []
     for ranks in (comm, MPI.COMM_SELF):
         scene = block(ranks, TURN | {"reaction": True}, 30).scene

@@ -66,6 +66,7 @@ def dense_gap(case: Setup, x: Array, terminal: Array, Q: Array, R: Array) -> tup
     return float(cost + X[-1] @ terminal @ X[-1]), float(gap)
 
 
+@pytest.mark.ranks(ends="any Z")
 @pytest.mark.parametrize("ends", ["nothing to come", "Riccati", "any Z"])
 @pytest.mark.parametrize("name", list(CASES))
 def test_gap_is_the_adjoint_recursion_and_bounds_the_excess(name: str, ends: str) -> None:
