@@ -12,7 +12,8 @@ torque. The midpoint rule over a step h, with M_a, G_a and v at half of it by ex
     [M_mj + J'(M_a - G_a'S^-1 G_a) J] qacc = MuJoCo's forces - J'[(M_a - G_a'S^-1 G_a) b + G_a'S^-1 r + v]
 
 so that MuJoCo solves for robot and tissue together, contact included: the bracket goes into its mass matrix, which is
-factored again, the right-hand side is a generalised force, and action is reaction.
+factored again, the right-hand side is a generalised force, and action is reaction. `step.c` has the small algebra;
+without a compiler NumPy does it.
 """
 
 from __future__ import annotations
@@ -27,11 +28,13 @@ from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.frame.rotation import cross_matrix
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
+from softgrasp.reduction.bridges.compiled import CompiledStep
 from softgrasp.reduction.system import ModelError
 from softgrasp.reduction.turning.model import TurningModel
 
 AXES = cross_matrix(np.eye(3))  # the matrices of e_c x, (3, 3, 3)
 EYE = np.eye(3)
+NOT_FINITE = "the state of the tissue in MuJoCo is not finite; use a shorter step or softer controls"
 LIGHT = 1 - 1e-6  # of the mass of the tissue, which its body has at least
 
 
@@ -97,9 +100,9 @@ class MujocoTissue:
         self._loads, self._forces = np.ascontiguousarray(sums), np.hstack([small.K, small.D + dt / 2 * small.K])
         self._turns = np.vstack([np.zeros((2, 9)), AXES.reshape(3, 9)])
         self._J, self._Jd, self._six = np.zeros((6, nv)), np.zeros((6, nv)), np.zeros((6, 6))
-        self._places = (
-            nv * np.repeat(np.arange(nv), mj_model.M_rownnz) + mj_model.M_colind
-        )  # of the lower triangle in M
+        self._rows = np.repeat(np.arange(nv, dtype=np.intc), mj_model.M_rownnz)  # of the lower triangle in M
+        self._columns = np.array(mj_model.M_colind, dtype=np.intc)
+        self._code = CompiledStep.of(self)
 
     @property
     def outputs(self) -> dict[str, float]:
@@ -115,7 +118,7 @@ class MujocoTissue:
         self.mujoco.mj_forward(self.mj_model, data)
         fall = data.xmat[self.body].reshape(3, 3).T @ self.mj_model.opt.gravity
         self.a = np.linalg.solve(self.small.K, self.small.G[:, :3] @ fall)
-        self.e, self._past, self._rate = np.zeros_like(self.a), np.zeros_like(self.a), np.zeros(3)
+        self.e, self._past[:], self._rate[:] = np.zeros_like(self.a), 0.0, 0.0
 
     def step(self, data: Any) -> None:
         """``mujoco.mj_step`` with the tissue; ``data`` may have controls and applied forces of the user.
@@ -124,15 +127,27 @@ class MujocoTissue:
         """
         mujoco, model = self.mujoco, self.mj_model
         mujoco.mj_step1(model, data)
-        Q = data.xmat[self.body].reshape(3, 3)
-        six = self._six
-        six[:3, :3] = six[3:, 3:] = Q.T
         mujoco.mj_jacBody(model, data, self._J[:3], self._J[3:], self.body)
         mujoco.mj_jacDot(model, data, self._Jd[:3], self._Jd[3:], data.xpos[self.body], self.body)
+        if self._code is None:
+            self._in_numpy(data)
+            return
+        self._code.begin(data, self.a, self.e)
+        mujoco.mj_factorM(model, data)
+        mujoco.mj_step2(model, data)
+        if not self._code.end():
+            raise ModelError(NOT_FINITE)
+        self.a, self.e, self.wrench = self._code.state()
+
+    def _in_numpy(self, data: Any) -> None:
+        """The step after the Jacobian is known."""
+        mujoco, model, six = self.mujoco, self.mj_model, self._six
+        Q = data.xmat[self.body].reshape(3, 3)
+        six[:3, :3] = six[3:, 3:] = Q.T
         J, before = six @ self._J, data.qvel.copy()
         b = six @ (self._Jd @ before)
         inertia, force, right, G = self._known(J[3:] @ before, Q.T @ model.opt.gravity)
-        data.M[:] += (J.T @ inertia @ J).take(self._places)
+        data.M[:] += (J.T @ inertia @ J)[self._rows, self._columns]
         mujoco.mj_factorM(model, data)
         user = data.qfrc_applied.copy()
         data.qfrc_applied[:] -= J.T @ (inertia @ b + force)
@@ -180,10 +195,10 @@ class MujocoTissue:
     def _advance(self, acceleration: Array, right: Array, G: Array) -> None:
         change = self.dt * (self.inverse @ (right - G @ acceleration))
         if not np.isfinite(change).all():
-            raise ModelError("the state of the tissue in MuJoCo is not finite; use a shorter step or softer controls")
+            raise ModelError(NOT_FINITE)
         self.a = self.a + self.dt * (self.e + change / 2)
         self.e = self.e + change
-        self._past, self._rate = change, acceleration[3:]
+        self._past[:], self._rate[:] = change, acceleration[3:]
 
 
 def _skew(m: Array) -> Array:

@@ -105,8 +105,29 @@ def test_a_free_body_with_tissue_keeps_what_a_rigid_one_keeps() -> None:
                 kept.append(Q @ P)
         drift.append(np.ptp(kept, axis=0).max() / np.linalg.norm(kept[0]))
         assert rigid or np.abs(tissue.a).max() > 0
-    assert drift[1] < 1.3 * drift[0]  # the paths differ a little; measured 1.07
+    assert drift[1] < 1.02 * drift[0]  # the paths differ a little; measured 0.999
     assert drift[1] < 5e-4
+
+
+def test_the_compiled_step_is_that_in_numpy(rom: TurningModel) -> None:
+    """A hand on a link that spins, under gravity, with a force of the user and data changed on the way."""
+    link = '<body><joint axis="0 1 0" damping="0.3"/><geom size=".05" pos="0 0 .2" mass="1"/>'
+    model, states = world(f"{link}{mujoco_body(rom, joint=SLIDES)}</body>", 1e-3, "1 2 -9.81"), []
+    for compiled in (True, False):
+        tissue, data = MujocoTissue(rom, model), mujoco.MjData(model)
+        assert tissue._code is not None
+        if not compiled:
+            tissue._code = None
+        data.qvel[:], data.qfrc_applied[:] = [4.0, 1.0, 2.0, -1.0], [0.3, 1.0, 0.0, 2.0]
+        for n in range(40):
+            if n == 20:
+                copy = mujoco.MjData(model)
+                copy.qpos[:], copy.qvel[:], copy.qfrc_applied[:] = data.qpos, data.qvel, data.qfrc_applied
+                data = copy
+            tissue.step(data)
+        states.append(np.concatenate([data.qpos, data.qvel, data.qfrc_applied, tissue.a, tissue.e, tissue.wrench]))
+    assert np.abs(tissue.a).max() > 1e-5
+    assert np.abs(states[0] - states[1]).max() < 1e-11 * np.abs(states[1]).max()  # rounding of forty steps
 
 
 @pytest.mark.parametrize(("solver", "digits"), [("Newton", 1e-8), ("CG", 1e-4)])

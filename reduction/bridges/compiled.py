@@ -1,0 +1,74 @@
+"""The small algebra of `MujocoTissue` in C: `step.c`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.obstacles.compiled import HEADER, RIDGE
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.strain.compiled import library
+
+SOURCE = Path(__file__).with_name("step.c")
+FUNCTIONS = """
+void softgrasp_tissue_begin(const Tissue *t, const double *gravity, double *room);
+int softgrasp_tissue_end(const Tissue *t, double *room);
+"""
+ROOM = {"known": "k", "pulled": "k6", "turned": "k6", "pairs": "k99", "six": "n6", "product": "n6", "b": "6",
+        "before": "n", "user": "n", "inertia": "66", "force": "6", "wrench": "6", "a": "k", "e": "k"}  # fmt: skip
+
+
+class CompiledStep:
+    """What a step does before and after MuJoCo solves, in place in its data."""
+
+    def __init__(self, compiled: Any, tissue: Any) -> None:
+        self._ffi, self._code = compiled
+        self._body, self._gravity, self._data = tissue.body, tissue.mj_model.opt.gravity, None
+        small, k, nv = tissue.small, len(tissue.a), tissue.mj_model.nv
+        sizes = {"k": k, "n": nv, "6": 6, "9": 9}
+        room = {name: np.zeros(int(np.prod([sizes[c] for c in size]))) for name, size in ROOM.items()}
+        given = {
+            "E": small.E, "sums": tissue._loads, "G": small.G, "K": small.K, "D": small.D + tissue.dt / 2 * small.K,
+            "inverse": tissue.inverse, "J": tissue._J, "Jd": tissue._Jd, "past": tissue._past, "rate": tissue._rate,
+        }  # fmt: skip
+        self._arrays = {name: np.ascontiguousarray(array) for name, array in given.items()} | room
+        self._rows, self._columns = tissue._rows, tissue._columns
+        self._struct = self._ffi.new("Tissue *")
+        self._struct.k, self._struct.nv, self._struct.entries = k, nv, len(self._rows)
+        self._struct.h = tissue.dt
+        for name, array in self._arrays.items():
+            setattr(self._struct, name, self._at(array))
+        self._struct.rows, self._struct.columns = self._at(self._rows, "int"), self._at(self._columns, "int")
+        self._room, self._fall = np.zeros(2 * k), self._at(self._gravity)
+        self._room_at = self._at(self._room)
+
+    @classmethod
+    def of(cls, tissue: Any) -> CompiledStep | None:
+        """For a tissue whose arrays are there; None, with a warning, without a compiler."""
+        code = SOURCE.read_text()
+        struct = code[code.index("typedef struct {") : code.index("} Tissue;")] + "} Tissue;\n"
+        otherwise = "tissue in MuJoCo is stepped in NumPy, more slowly"
+        compiled = library(SOURCE, struct + FUNCTIONS, otherwise, HEADER, (f"RIDGE={RIDGE!r}",))
+        return None if compiled is None else cls(compiled, tissue)
+
+    def _at(self, values: Any, kind: str = "double") -> Any:
+        return self._ffi.from_buffer(f"{kind}[]", values)
+
+    def begin(self, data: Any, a: Array, e: Array) -> None:
+        """Inertia into MuJoCo's mass matrix, forces into the applied ones."""
+        if data is not self._data:  # its arrays stay where they are
+            self._data, self._views = data, (data.xmat[self._body], data.qvel, data.M, data.qfrc_applied)
+            for name, view in zip(("Q", "qvel", "M", "applied"), self._views, strict=True):
+                setattr(self._struct, name, self._at(view))
+        self._arrays["a"][:], self._arrays["e"][:] = a, e
+        self._code.softgrasp_tissue_begin(self._struct, self._fall, self._room_at)
+
+    def end(self) -> bool:
+        """The state at the end of the step; whether it is finite."""
+        return bool(self._code.softgrasp_tissue_end(self._struct, self._room_at))
+
+    def state(self) -> tuple[Array, Array, Array]:
+        """Coordinates, rates and wrench."""
+        return self._arrays["a"].copy(), self._arrays["e"].copy(), self._arrays["wrench"].copy()
