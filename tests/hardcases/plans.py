@@ -46,6 +46,36 @@ def one_step(*_: str) -> float:
     return float(np.abs(nearest(-np.eye(2), -np.ones(2), limit=1).x - 1).max())
 
 
+@cache
+def many_rows() -> tuple[np.ndarray, np.ndarray]:
+    """A hundred thousand half-spaces in twenty dimensions that leave the origin out, all of which (2, 0, ..) keeps."""
+    rng = np.random.default_rng(0)
+    G = rng.standard_normal((100_000, 20))
+    G /= np.linalg.norm(G, axis=1)[:, None]
+    G[:, 0] = -np.abs(G[:, 0])
+    return G, 2 * G[:, 0] + 0.1 * rng.random(len(G))
+
+
+def optimality(*_: str) -> float:
+    """Largest violation of the conditions of Karush, Kuhn and Tucker."""
+    G, h = many_rows()
+    found = nearest(G, h)
+    gap = G @ found.x - h
+    stationary = np.abs(found.x + G.T @ found.multipliers).max()
+    return float(max(gap.max(), stationary, np.abs(found.multipliers * gap).max(), -found.multipliers.min()))
+
+
+def projected(*_: str) -> float:
+    """Largest violation after a thousand projections on the half-space that is violated most."""
+    G, h = many_rows()
+    x = np.zeros(20)
+    for _step in range(1000):
+        gap = G @ x - h
+        i = int(gap.argmax())
+        x = x - max(gap[i], 0.0) * G[i]
+    return float(max((G @ x - h).max(), np.abs(x - nearest(G, h).x).max()))
+
+
 PLANS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("wall 5 cm behind the target", (f"obstacle=[{WALL}]",), 0.0),
     ("two equal walls", (f"obstacle=[{WALL}, {WALL}]",), 0.0),
@@ -95,6 +125,8 @@ def plan_rows(quick: bool) -> Iterator[HardCase]:
         yield HardCase(name, number + 1.0, here(depth, *changes), textbook(depth_free, *changes), bound, reason)
     limited = textbook(lambda: Outcome(None, "has no limit"))
     yield HardCase("one step of the active set", len(PLANS) + 1.0, here(one_step), limited, None, "it needs two")
+    rows = "rounding of the conditions of optimality"
+    yield HardCase("a hundred thousand rows", len(PLANS) + 2.0, here(optimality), textbook(projected), 1e-12, rows)
 
 
 MARKERS = "markers=[[0, 0], [1, 0], [0, 1], [1, 1]]"

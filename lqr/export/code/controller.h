@@ -28,10 +28,13 @@ typedef struct {
     long limited;     /* programs that took more than SG_PLAN_STEPS changes of the active set; the last plan went on */
     int steps;        /* changes in the last program */
     int warm[SG_PLAN_VARIABLES + SG_PLAN_SLACKS], warm_count; /* rows to begin the next program with */
-    double coefficients[SG_PLAN_VARIABLES][SG_PLAN_ROWS], size[SG_PLAN_ROWS]; /* of all rows, made at the start */
+    double coefficients[SG_PLAN_VARIABLES][SG_PLAN_ROWS], size[SG_PLAN_ROWS], bend[SG_PLAN_ROWS]; /* of all rows, made at the
+                                                                                                start */
     int first[SG_PLAN_INTERVALS], offset[SG_PLAN_INTERVALS + 1], count;       /* the program at hand */
     short at[SG_PLAN_LARGEST];
     double h[SG_PLAN_LARGEST], violation[SG_PLAN_LARGEST];
+    double looked[SG_PLAN_VARIABLES], most[SG_PLAN_INTERVALS]; /* c at which all rows were looked at, what was found */
+    int whole;                                                 /* whether it is the last c */
     int row[SG_PLAN_VARIABLES + SG_PLAN_SLACKS]; /* its active set: rows, triangle, basis, right-hand sides */
     double R[SG_PLAN_VARIABLES + SG_PLAN_SLACKS][SG_PLAN_VARIABLES + SG_PLAN_SLACKS];
     double Q[SG_PLAN_VARIABLES + SG_PLAN_SLACKS][SG_PLAN_VARIABLES + SG_PLAN_SLACKS];

@@ -35,9 +35,20 @@ static double root(double x) {
     }
 }
 
-/* y += A x with columns of n entries, `stride` apart. */
-static void apply_columns(const double *A, int stride, const double *x, int columns, double *y, int n) {
-    for (int j = 0; j < columns; ++j) add(x[j], A + (long)j * stride, y, n);
+/* y += A x with columns of n entries, `stride` apart; four at a time, so that y is read and written less often. */
+static void apply_columns(const double *A, int stride, const double *x, int columns, double *restrict y, int n) {
+    int j = 0;
+    for (; j + 4 <= columns; j += 4) {
+        const double *restrict a = A + (long)j * stride, *restrict b = a + stride, *restrict c = b + stride,
+                     *restrict d = c + stride;
+        for (int i = 0; i < n; ++i) {
+            double sum = y[i] + x[j] * a[i];
+            sum += x[j + 1] * b[i];
+            sum += x[j + 2] * c[i];
+            y[i] = sum + x[j + 3] * d[i];
+        }
+    }
+    for (; j < columns; ++j) add(x[j], A + (long)j * stride, y, n);
 }
 
 static int kind_of(long k) { return k < PH ? (int)k : PH; }
@@ -50,7 +61,7 @@ static void along_way(double x[PN], const double *c) {
     for (int i = 0; i < PN; ++i) x[i] = next[i];
 }
 
-/* Coefficients of all rows by lag, the latest last, and their sizes. */
+/* Coefficients of all rows by lag, the latest last, their sizes, and the largest bend of the swings that are allowed. */
 static void make_rows(sg_plan *p) {
     for (int r = 0; r < PR; ++r) {
         double row[PN], next[PN], sum = 0;
@@ -64,6 +75,12 @@ static void make_rows(sg_plan *p) {
         for (int b = 0; b < PC; ++b) sum += p->coefficients[b][r] * p->coefficients[b][r];
         p->size[r] = sum > 0 ? root(sum) : 1;
     }
+    for (int own = 0; own <= PH; ++own)
+        for (int r = PLAN_FIRST[own]; r < PLAN_FIRST[own + 1]; ++r) {
+            double one = dot(PLAN_LEAVES[r], PLAN_MOST[own][PLAN_PART[r][0]], PK);
+            double other = dot(PLAN_LEAVES[r], PLAN_MOST[own][PLAN_PART[r][1]], PK);
+            p->bend[r] = (1 + KEEPS) * (one > other ? one : other);
+        }
 }
 
 /* Right-hand sides of the horizon that begins at an interval in state x. */
@@ -185,22 +202,38 @@ static void restart(sg_plan *p, const int *rows, int count, int soft, int n) {
     }
 }
 
-/* The row that is violated most, by the size of its row; -PV - 1 where all are kept. */
+/* What the plan leaves of rows begin, .., end - 1 of interval k in p->violation, and the violation of the block of rows
+   that has the largest, by the size of each row; `worst` is the row of the largest of all so far. */
+static double look(sg_plan *p, int k, int begin, int end, int soft, double *most, int *worst) {
+    int r = p->first[k] + begin, at = p->offset[k] + begin, rows = end - begin;
+    double *left = p->violation + at, largest = -1 / VIOLATION;
+    for (int i = 0; i < rows; ++i) left[i] = p->h[at + i];
+    apply_columns(&p->coefficients[PC - M * (k + 1)][r], PR, p->c, M * (k + 1), left, rows);
+    for (int i = 0; i < rows; ++i) {
+        int gap = PLAN_OBSTACLE[r + i];
+        double over = -left[i] + (soft && gap >= 0 ? (1 - p->c[PC + gap * PH + k]) / SG_PLAN_PRICE : 0);
+        over /= p->size[r + i];
+        if (over > largest) largest = over;
+        if (over > *most) *most = over, *worst = at + i;
+    }
+    return largest;
+}
+
+/* The row that is violated most, by the size of its row; -PV - 1 where all are kept. No violation changes by more than
+   c moves: intervals whose rows were all kept by more than that, when they were looked at last, are left out. */
 static int worst_row(sg_plan *p, int soft, double *most) {
-    int worst = -PV - 1;
-    double allowed = VIOLATION * (1 + root(dot(p->c, p->c, soft ? PV : PC)));
+    int worst = -PV - 1, whole = soft || !p->steps;
+    double allowed = VIOLATION * (1 + root(dot(p->c, p->c, soft ? PV : PC))), moved = 0;
     *most = allowed;
+    if (whole)
+        for (int b = 0; b < PC; ++b) p->looked[b] = p->c[b];
+    for (int b = 0; b < PC; ++b) moved += (p->c[b] - p->looked[b]) * (p->c[b] - p->looked[b]);
+    p->whole = !soft && moved == 0;
+    moved = root(moved);
     for (int k = 0; k < PH; ++k) {
-        int rows = p->offset[k + 1] - p->offset[k], first = p->first[k];
-        double *v = p->violation;
-        for (int i = 0; i < rows; ++i) v[i] = p->h[p->offset[k] + i];
-        apply_columns(&p->coefficients[PC - M * (k + 1)][first], PR, p->c, M * (k + 1), v, rows);
-        for (int i = 0; i < rows; ++i) {
-            int gap = PLAN_OBSTACLE[first + i];
-            double over = -v[i] + (soft && gap >= 0 ? (1 - p->c[PC + gap * PH + k]) / SG_PLAN_PRICE : 0);
-            over /= p->size[first + i];
-            if (over > *most) *most = over, worst = p->offset[k] + i;
-        }
+        if (!whole && p->most[k] + moved <= allowed) continue;
+        double largest = look(p, k, 0, p->offset[k + 1] - p->offset[k], soft, most, &worst);
+        if (whole) p->most[k] = largest;
     }
     for (int i = 0; soft && i < PS; ++i) {
         double over = 1 - p->c[PC + i];
@@ -259,7 +292,7 @@ static int judge_plan(sg_plan *p, long interval, const double *begin, const doub
     for (int i = 0; i < PN; ++i) x[i] = begin[i];
     for (int k = 0; k < PH; ++k, c += M) {
         int own = kind_of(interval + k), first = PLAN_FIRST[own], rows = PLAN_FIRST[own + 1] - first;
-        double u[M] = {0}, *left = p->violation, at_way[M];
+        double u[M] = {0}, *left = p->violation + p->offset[k], at_way[M];
         for (int i = 0; i < PN; ++i) off[i] = x[i] - PLAN_WAY[own][i];
         for (int s = 0; s < M; ++s) at_way[s] = c[s] - (own < PH ? PLAN_WAY_C[own][s] : 0);
         for (int i = 0; i <= PP; ++i) {
@@ -281,15 +314,22 @@ static int judge_plan(sg_plan *p, long interval, const double *begin, const doub
         }
         apply_columns(&PLAN_K[0][0], M, x, PN, u, M);
         apply_columns(&PLAN_L[0][0], M, c, M, u, M);
-        for (int i = 0; i < rows; ++i) left[i] = PLAN_EXACT[first + i];
-        apply_columns(&PLAN_A[0][first], PR, x, PN, left, rows);
-        apply_columns(&PLAN_NOW[0][first], PR, c, M, left, rows);
+        if (p->whole) { /* the rows of the program, with more room */
+            for (int i = 0; i < rows; ++i) left[i] += PLAN_EXACT[first + i] - PLAN_FREE[first + i];
+        } else {
+            for (int i = 0; i < rows; ++i) left[i] = PLAN_EXACT[first + i];
+            apply_columns(&PLAN_A[0][first], PR, x, PN, left, rows);
+            apply_columns(&PLAN_NOW[0][first], PR, c, M, left, rows);
+        }
         for (int i = 0; i < rows; ++i) {
             int r = first + i;
             if (PLAN_OBSTACLE[r] < 0) {
                 if (!(left[i] >= -KEEPS)) return 0;
                 continue;
             }
+            double most = p->bend[r];
+            for (int s = 0; s < M; ++s) most += size(PLAN_ALONG[r][s] * u[s]);
+            if (left[i] >= most) continue;
             double one = dot(PLAN_LEAVES[r], swings[PLAN_PART[r][0]], PK);
             double other = dot(PLAN_LEAVES[r], swings[PLAN_PART[r][1]], PK), bend = one > other ? one : other;
             bend += dot(PLAN_ALONG[r], u, M);
