@@ -12,7 +12,8 @@ the same scalar function of omega_m, f_h instead of f, so that at a node j
     |c_j'(zeta_h - zeta)| <= |c_j|_{K^{-1}} |X|_K max over omega of |f_h - f|,
 
 both norms without the known modes; chords between two instants, and what follows the last one, are bounded the same
-way. Frequencies are a fine grid from the last known one to the highest of the mesh.
+way. Frequencies are a fine grid from the last known one to the highest of the mesh; what is between two of them,
+rounding and the residual of the known modes are not bounded.
 """
 
 from __future__ import annotations

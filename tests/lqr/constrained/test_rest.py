@@ -9,6 +9,7 @@ import pytest
 
 from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene
+from softgrasp.lqr.constrained import rest as rest_module
 from softgrasp.lqr.constrained.pulse import PulseError
 from softgrasp.lqr.constrained.rest import Rest, known_tissue, run_rest
 from softgrasp.lqr.constrained.tissue import ModalTissue, Surface, make_surface, modal_tissue
@@ -29,7 +30,7 @@ def runs(*overrides: str, grid: float = GRID) -> tuple[RiccatiProblem, Surface, 
     return problem, surface, known, run_rest(problem, surface, known, V, grid)
 
 
-@pytest.mark.ranks
+@pytest.mark.serial
 @pytest.mark.parametrize("overrides", [("tissue.cells=[5, 10]",), TWO_WAY])
 def test_runs_give_the_bound_of_all_modes(overrides: tuple[str, ...]) -> None:
     problem, surface, known, rest = runs(*overrides)
@@ -47,6 +48,22 @@ def test_runs_give_the_bound_of_all_modes(overrides: tuple[str, ...]) -> None:
     assert bound.max() < 1.1 * exact.max()
 
 
+@pytest.mark.ranks(2)
+def test_ranks_share_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rest_module, "STEPS", 16)  # messages are dear where ranks share a processor
+    monkeypatch.setattr(rest_module, "HALVINGS", 2)
+    monkeypatch.setattr(rest_module, "TOGETHER", 5)
+    problem, surface, known, rest = runs("tissue.cells=[4, 9]")
+    full = modal_tissue(problem, surface)
+    by_runs = PulseError(known, known.reduced(7, GRID), GRID, rest)
+    by_modes = PulseError(full, full.reduced(7, GRID), GRID)
+    for i in range(1, len(rest.instants), 5):
+        exact = by_modes.level(float(rest.instants[i])) @ LARGEST
+        off = np.abs(by_runs.level_at(i) @ LARGEST - exact)
+        assert (off <= 2 * rest.error(i) @ LARGEST + 1e-6 * exact.max()).all()  # residual of the modes
+
+
+@pytest.mark.serial
 def test_the_error_of_a_run_is_below_its_bound() -> None:
     problem, surface, known, rest = runs("tissue.cells=[5, 10]")
     full, lowest = modal_tissue(problem, surface), known.lowest
@@ -64,6 +81,7 @@ def test_the_error_of_a_run_is_below_its_bound() -> None:
     assert 0 < worst < 1e-4 * np.abs(static).max()
 
 
+@pytest.mark.serial
 def test_bounded_runs_keep_the_bound_and_the_worst_one_attains_it() -> None:
     problem, surface, known, rest = runs("tissue.cells=[5, 10]")
     full, rng = modal_tissue(problem, surface), np.random.default_rng(1)
@@ -88,6 +106,7 @@ def test_bounded_runs_keep_the_bound_and_the_worst_one_attains_it() -> None:
     assert abs(reached / level[j, d] - 1) < 1e-6
 
 
+@pytest.mark.serial
 def test_modes_that_are_slow_are_run_for_more_intervals() -> None:
     grid = 0.4
     problem, surface, known, rest = runs("tissue.cells=[5, 10]", grid=grid)
