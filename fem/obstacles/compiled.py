@@ -25,7 +25,7 @@ def contact_library() -> Any:
     return compiled(SOURCE, code[code.index("typedef struct {") :] + DECLARATIONS)
 
 
-DONE, TAKE, ENTER, BALANCE, UNSOLVED, UNSETTLED = range(6)  # what a step needs before it goes on
+DONE, TAKE, ENTER, BALANCE, SOLVE, UNSOLVED, UNSETTLED = range(7)  # what a step needs before it goes on
 DECLARATIONS = """
 int softgrasp_complement(int p, int ld, const double *W, const double *q, double tol, int most,
   int *count, int *order, double *L, double *x, int *side, double *room, long *tally);

@@ -83,28 +83,34 @@ static void add_to_r(const Flat *f, int j, double t) {
   }
 }
 
-/* Take forces x instead of those before into w and r, four columns in a pass. */
-static void apply(const Flat *f, const double *x) {
-  const int columns = f->count_columns;
-  const double *c[4];
-  double t[4];
-  int m = 0;
-  memset(f->change, 0, columns * sizeof(double));
+/* Take forces x instead of those before into r; by how much they change into `change`. Returns how many do. */
+static int take(const Flat *f, const double *x) {
+  int changes = 0;
+  memset(f->change, 0, f->count_columns * sizeof(double));
   for (int j = 0; j < f->k; j++) {
     double more = x[j] - f->x[j];
     f->x[j] = x[j];
     if (more == 0) continue;
+    changes++;
     add_to_r(f, j, more);
     f->change[f->row[4 * j + 2]] += more;
   }
-  for (int k = 0; k <= columns; k++) {
-    if (k < columns && f->change[k] != 0) {
+  return changes;
+}
+
+/* Take these changes into w, four columns in a pass. */
+static void apply(const Flat *f) {
+  const double *c[4];
+  double t[4];
+  int m = 0;
+  for (int k = 0; k <= f->count_columns; k++) {
+    if (k < f->count_columns && f->change[k] != 0) {
       c[m] = f->columns + (size_t)k * f->n;
       t[m++] = f->change[k];
     }
     if (m == 4)
       for (int i = 0; i < f->n; i++) f->w[i] += (t[0] * c[0][i] + t[1] * c[1][i]) + (t[2] * c[2][i] + t[3] * c[3][i]);
-    else if (k == columns)
+    else if (k == f->count_columns)
       for (; m > 0; m--)
         for (int i = 0; i < f->n; i++) f->w[i] += t[m - 1] * c[m - 1][i];
     if (m == 4) m = 0;
@@ -187,7 +193,11 @@ int softgrasp_step(Flat *f, int n) {
           return UNSOLVED;
         break;
       case FORCES:
-        apply(f, f->to);
+        f->stage = TAKEN;
+        if ((double)take(f, f->to) * f->n > f->entries) return SOLVE;
+        apply(f);
+        break;
+      case TAKEN:
         if (f->feels) push(f, n);
         f->stage = AFTER;
         if (!f->whole) return TAKE;

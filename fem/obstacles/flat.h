@@ -2,8 +2,8 @@
 #include "dense.h"
 
 enum { MODES = 8 }; /* freedoms of a hand, at most */
-enum { DONE, TAKE, ENTER, BALANCE, UNSOLVED, UNSETTLED };
-enum { BEGIN, UNTOUCHED, ROWS, FORCES, AFTER };
+enum { DONE, TAKE, ENTER, BALANCE, SOLVE, UNSOLVED, UNSETTLED };
+enum { BEGIN, UNTOUCHED, ROWS, FORCES, TAKEN, AFTER };
 
 typedef struct {
   int p, d, n_s, obstacles; /* boundary nodes, axes, freedoms of the hand, half-spaces */
@@ -35,7 +35,8 @@ typedef struct {
   const double *columns;    /* S^-1 N' on the rows here, a column after the other (.., n) */
   const double *W;          /* N S^-1 N', with the hand's part where it feels the tissue (k, k) */
   double *free, *x, *b;     /* right-hand side of the small problem, forces, velocities to stop (k) */
-  double *change;           /* what the last `apply` added to the force of each column */
+  double *change;           /* what the last forces added to that of each column */
+  double entries;           /* that a solve reads: where columns have more, it is taken instead of them */
   const double *B, *Y, *G;  /* of a hand that feels the tissue: directions times reach (columns, n_s), S^-1 G, G (n_s, n) */
   const double *inverse;    /* L^-1 of its equation (n_s, n_s) */
   int *count, *order, *side; /* small problem, see `softgrasp_complement` */

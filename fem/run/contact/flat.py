@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles import HalfSpace
-from softgrasp.fem.obstacles.compiled import BALANCE, DONE, ENTER, TAKE, UNSETTLED, contact_library
+from softgrasp.fem.obstacles.compiled import BALANCE, DONE, ENTER, SOLVE, TAKE, UNSETTLED, contact_library
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.contact.general import MOST, ROUNDING, STILL, Contact, unsettled
 from softgrasp.fem.run.contact.rows import Ints, Rows
@@ -28,6 +28,7 @@ KINDS = {
     np.dtype(float): "double[]", np.dtype(np.intc): "int[]", np.dtype(bool): "char[]", np.dtype(np.int64): "long[]",
 }  # fmt: skip
 """Types in C."""
+READS = 2  # of every entry of the factor by a solve
 
 
 class FlatContact(Contact):
@@ -71,6 +72,8 @@ class FlatContact(Contact):
         f.p, f.d, f.n_s, f.obstacles, f.m = self.p, d, self.layout.n_s, obstacles, self.along.shape[1] - 1
         f.n, f.here, f.whole = len(m.w_array), self.layout.n_local, at.min(initial=0) >= 0
         f.dt, f.s, f.extent, f.rounding, f.at_rest = self.dt, self.s, self.layout.extent, ROUNDING, STILL
+        solved = m.solver.entries if self.surface.B is None else None
+        f.entries = np.inf if solved is None else READS * solved
         f.most, f.most_each, f.compiled = MOST, self.small.most, f.m == 0 and self.surface.B is None
         self.v, self.q = np.zeros(size), np.zeros(f.n_s)
         self.level, self.rate, self.least = self.offsets.copy(), np.zeros((obstacles, d)), np.zeros(obstacles)
@@ -138,6 +141,8 @@ class FlatContact(Contact):
                 self._enter(np.argwhere((self.after < -f.depth) & ~self.entered))
             elif wanted == BALANCE:
                 self.point(to=self._balance(f.tol / 4))
+            elif wanted == SOLVE:
+                self._solve()
             else:
                 raise unsettled(f.reached) if wanted == UNSETTLED else SolverError(self.small.unsolved(f.k))
         if not f.pressed:
@@ -148,6 +153,14 @@ class FlatContact(Contact):
         if self.surface.B is not None:  # the forces on points are not on single unknowns
             self.forces = self.pressing().ravel()
             self._add_to_r()
+
+    def _solve(self) -> None:
+        """Take the changes of the forces into w by one more solve. Collective."""
+        f = self.responses.forces(self.change[: self.responses.count])
+        self.b.array_w[:] = 0.0
+        self.b.array_w[self.places] = f[self.order]
+        self.midpoint.solver.solve(self.b, self.y)
+        self.midpoint.w.axpy(1.0, self.y)
 
     def _balance(self, tol: float) -> Array:
         """Forces of the rows that leave no gap below -tol."""
@@ -177,8 +190,8 @@ class FlatContact(Contact):
         W, x = np.zeros((size, size)), np.zeros(size)
         W[:have, :have] = self.W[:have, :have]
         x[:have] = self.x[:have]
-        self.W, self.x, self.free, self.rates, self.struck = W, x, *np.zeros((3, size))
-        self.point(W=W, x=x, free=self.free, b=self.rates, y=self.struck, change=np.zeros(size))
+        self.W, self.x, self.free, self.rates, self.struck, self.change = W, x, *np.zeros((4, size))
+        self.point(W=W, x=x, free=self.free, b=self.rates, y=self.struck, change=self.change)
         self.f.ld = size
         self.stops.grow(size)
         self._fit(size)
