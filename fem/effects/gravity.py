@@ -41,5 +41,9 @@ class GravityEffect(Effect):
             "holds" if sag.gradient.linear else f"does not hold, {percent(sag.gradient.share)} of the body is above 0.1"
         )
         sentence = f"{begin} {bends}, by linear elasticity; {steep}: the theory {holds}."
-        proviso = "if its numbers are in SI units" if off else ""
-        return Gate(number, "|grad z| of its sag", self.threshold, number > self.threshold, sentence, proviso)
+        scene, proviso = problem.scene, "if its numbers are in SI units" if off else ""
+        gravity, feels = scene.effects.gravity, scene.effects.reaction
+        falls = gravity is not None and scene.motion.drive == "force" and (gravity.hand_weight or feels)
+        if falls:
+            sentence += " It also pulls on the hand, which a force drives: without it the motion is another one."
+        return Gate(number, "|grad z| of its sag", self.threshold, falls or number > self.threshold, sentence, proviso)
