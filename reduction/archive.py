@@ -21,6 +21,8 @@ from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.resources import MARGIN, reserve_room
+from softgrasp.reduction.contact.model import ContactModel
+from softgrasp.reduction.contact.parts import about_contact, read_contact, write_contact
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.operators import Reconstruction
 from softgrasp.reduction.system import ModelError, Outputs
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 
 LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 3"
 TURNING = "softgrasp reduced model in the frame of the hand 1"
+CONTACT = "softgrasp reduced model with contact 1"
 # what h5py and the reading of a model raise of a file that is not whole
 DAMAGE = (OSError, LookupError, TypeError, ValueError, RuntimeError, AttributeError, MemoryError)
 GROUP = "reconstruction"  # of the rows on the mesh; its checksum is an attribute sha256_reconstruction
@@ -57,7 +60,7 @@ FINER_ARRAYS = ("K_mu", "K_lambda", "G", "gram")
 FIELDS = {"tau": "cubature_tolerance", "residual": "cubature_residual", "reach": "largest_coordinates"}
 
 
-def save(model: ReducedModel | StrainModel | TurningModel, path: str | Path) -> None:
+def save(model: ReducedModel | StrainModel | TurningModel | ContactModel, path: str | Path) -> None:
     """Write a reduced model to one HDF5 file, atomically. Collective when the model has a reconstruction.
 
     The file has the small matrices in full precision, the outputs, and the reconstruction (2 or 3 arrays of n_e x N)
@@ -78,6 +81,11 @@ def save(model: ReducedModel | StrainModel | TurningModel, path: str | Path) -> 
         OSError: the folder cannot be made, or nothing may be written there.
         ResourceError: the disk is full; what was there before stays.
     """
+    if isinstance(model, ContactModel):
+        whole = None if model.V is None or model.layout is None else (model.layout, model.V, model.V[:, :0])
+        reconstruction = None if whole is None else Reconstruction(*whole)
+        write_model(Path(path), CONTACT, about_contact(model), reconstruction, partial(write_contact, model))
+        return
     if isinstance(model, ReducedModel):
         kind, reconstruction = LINEAR, model.reconstruction
     else:
@@ -123,7 +131,7 @@ def write_small(model: ReducedModel | StrainModel | TurningModel, file: h5py.Fil
 
 def load(
     path: str | Path, layout: BlockLayout | None = None, scene_hash: str | None = None
-) -> ReducedModel | StrainModel | TurningModel:
+) -> ReducedModel | StrainModel | TurningModel | ContactModel:
     """Read a reduced model of any kind. Collective over ``layout.comm``; without a layout each caller for itself.
 
     Args:
@@ -141,6 +149,9 @@ def load(
     True
     """
     with reading(Path(path), layout, scene_hash) as (file, data):
+        if file.attrs["format"] == CONTACT:
+            V = None if layout is None else np.asfortranarray(read_reconstruction(file, layout).L_q)
+            return read_contact(file, data, layout, V)
         if file.attrs["format"] == TURNING:
             return read_turning(file, data, layout)
         return (read_strain if file.attrs["format"] == STRAIN else read_linear)(file, data, layout)
@@ -258,7 +269,7 @@ def reading(
     with raise_on_all_ranks(comm):
         try:
             with h5py.File(no_pipe(path), "r") as file:
-                if file.attrs.get("format") not in (LINEAR, STRAIN, TURNING):
+                if file.attrs.get("format") not in (LINEAR, STRAIN, TURNING, CONTACT):
                     raise ModelError(f"{path} is no reduced model of this version ({LINEAR!r}); reduce the scene again")
                 # one rank reads a reconstruction twice, not all of them
                 for rows in (False, True) if layout is not None and comm.rank == 0 else (False,):

@@ -64,15 +64,17 @@ def _text(key: str, value: Any) -> str:
     return json.dumps(value)
 
 
-def check_origin(origin: Origin, keys: Mapping[str, Any], name: str) -> None:
-    """Refuse a scene, by its keys, that differs from that of a model in more than materials, motion and time.
+def check_origin(
+    origin: Origin, keys: Mapping[str, Any], name: str, free: tuple[re.Pattern[str], ...] = (MATERIAL, MOTION)
+) -> None:
+    """Refuse a scene, by its keys, that differs from that of a model in more than what is ``free``.
 
     Raises ModelError: with the first key that differs.
     """
     if not origin:
         warnings.warn(f"{name}: the model {UNKNOWN}", RuntimeWarning, stacklevel=3)
-    elif difference := differing(origin, origin_of(keys), (MATERIAL, MOTION)):
+    elif difference := differing(origin, origin_of(keys), free):
+        accepted = ("materials, " if MATERIAL in free else "") + "motions and times"
         raise ModelError(
-            f"the model was built {difference}; it accepts other materials, motions and times only, so reduce that "
-            "scene itself", name,
+            f"the model was built {difference}; it accepts other {accepted} only, so reduce that scene itself", name,
         )  # fmt: skip

@@ -14,6 +14,8 @@ from softgrasp.reduction.bases.inner import InnerName
 from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import BasisError, States
 from softgrasp.reduction.bases.truncation import Truncation
+from softgrasp.reduction.contact.model import ContactModel, ContactRun
+from softgrasp.reduction.contact.replay import ContactErrors, errors_contact, replay_contact
 from softgrasp.reduction.errors import ModelErrors
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory
@@ -84,7 +86,7 @@ def reduce(
         ReductionError: a model at finite strain with a linear one's options, or no weights reach their tolerance.
         SolverError: a factorisation failed, or a reduced run did not converge.
     """
-    model.scene.refuse_contact("a reduced model")
+    model.scene.refuse_contact("a basis of sg.reduce, unlike sg.contact_model,")
     if not (N is None or isinstance(N, Truncation | Integral)) or isinstance(N, bool):
         raise BasisError(f"N = {shortened(repr(N))} is no dimension; give a whole number, a Truncation or None")
     if not isinstance(runs, Trajectory | FullRun | Sequence):
@@ -111,9 +113,15 @@ def replay(rom: ReducedModel, model: Model, run: Trajectory | FullRun, *, allow:
 def replay(rom: StrainModel, model: Model, run: Trajectory | FullRun, *, allow: bool = ...) -> StrainRun: ...
 @overload
 def replay(rom: TurningModel, model: Model, run: Trajectory | FullRun, *, allow: bool = ...) -> TurningRun: ...
+@overload
+def replay(rom: ContactModel, model: Model, run: Trajectory | FullRun, *, allow: bool = ...) -> ContactRun: ...
 def replay(
-    rom: ReducedModel | StrainModel | TurningModel, model: Model, run: Trajectory | FullRun, *, allow: bool = False
-) -> ReducedTrajectory | StrainRun | TurningRun:
+    rom: ReducedModel | StrainModel | TurningModel | ContactModel,
+    model: Model,
+    run: Trajectory | FullRun,
+    *,
+    allow: bool = False,
+) -> ReducedTrajectory | StrainRun | TurningRun | ContactRun:
     """E x' = A x + B u + F g by the midpoint rule [HLW06], under the hand of a full run. Collective.
 
     The hand moves as it did where the basis keeps it apart (fixed solid modes), else it feels the force that gave its
@@ -148,6 +156,8 @@ def replay(
         from softgrasp.reduction.turning.projection import replay_turning
 
         return replay_turning(rom, as_full(model, run), model)
+    if isinstance(rom, ContactModel):
+        return replay_contact(rom, as_full(model, run), model)
     from softgrasp.reduction.strain.training import replay_strain
 
     return replay_strain(rom, as_full(model, run), model, outside=allow)
@@ -161,12 +171,14 @@ def errors(
 def errors(rom: StrainModel, reduced_run: StrainRun, model: Model, run: Trajectory | FullRun) -> StrainErrors: ...
 @overload
 def errors(rom: TurningModel, reduced_run: TurningRun, model: Model, run: Trajectory | FullRun) -> StrainErrors: ...
+@overload
+def errors(rom: ContactModel, reduced_run: ContactRun, model: Model, run: Trajectory | FullRun) -> ContactErrors: ...
 def errors(
-    rom: ReducedModel | StrainModel | TurningModel,
-    reduced_run: ReducedTrajectory,
+    rom: ReducedModel | StrainModel | TurningModel | ContactModel,
+    reduced_run: ReducedTrajectory | ContactRun,
     model: Model,
     run: Trajectory | FullRun,
-) -> ModelErrors | StrainErrors:
+) -> ModelErrors | StrainErrors | ContactErrors:
     """|X - X_r| / |X| over the snapshots X of a full run [SBRH21]: states, deformation, energy. Collective.
 
     >>> import softgrasp as sg
@@ -187,6 +199,10 @@ def errors(
         ModelError: the reduced run is shorter than the full one, or the model was loaded without its reconstruction.
     """
     full = as_full(model, run)
+    if isinstance(rom, ContactModel):
+        assert isinstance(reduced_run, ContactRun)
+        return errors_contact(rom, reduced_run, full)
+    assert not isinstance(reduced_run, ContactRun)
     if isinstance(rom, ReducedModel):
         return errors_linear(rom, reduced_run, full)
     if isinstance(rom, TurningModel):

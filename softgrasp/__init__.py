@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from softgrasp.lqr.spectrum.certificate import abscissa as abscissa
     from softgrasp.reduction.archive import load as load
     from softgrasp.reduction.archive import save as save
-    from softgrasp.reduction.contact.model import contact_model as contact_model
+    from softgrasp.reduction.contact.make import contact_model as contact_model
     from softgrasp.reduction.gradient.face import gradient as gradient
     from softgrasp.reduction.identify.identify import identify as identify
     from softgrasp.reduction.identify.suggest import suggest_markers as suggest_markers
@@ -65,7 +65,7 @@ _FACE = {
     "gradient": "reduction.gradient.face",
     "identify": "reduction.identify.identify",
     "suggest_markers": "reduction.identify.suggest",
-    "contact_model": "reduction.contact.model",
+    "contact_model": "reduction.contact.make",
     "save": "reduction.archive",
     "load": "reduction.archive",
     "problem": "lqr.design",

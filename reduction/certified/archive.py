@@ -17,7 +17,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import Profile
-from softgrasp.reduction.archive import LINEAR, about, read_linear, reading, write_model, write_small
+from softgrasp.reduction.archive import CONTACT, LINEAR, about, read_linear, reading, write_model, write_small
 from softgrasp.reduction.certified.certificate import OfflineMeshEstimate
 from softgrasp.reduction.certified.dual import OutputDuals
 from softgrasp.reduction.certified.model import CertifiedModel, ParameterDomain
@@ -99,6 +99,11 @@ def load_certified(path: str | Path, layout: BlockLayout | None = None) -> Certi
         ModelError: the file is missing, damaged, without a certificate, or of another mesh.
     """
     with reading(Path(path), layout) as (file, data):
+        if file.attrs["format"] == CONTACT:
+            raise ModelError(
+                f"{path} has contact, which no certificate covers; run it in Python by sg.load, or reduce the scene "
+                "without effects.obstacles by softgrasp reduce SCENE --tolerance"
+            )
         group = file.get(GROUP)
         if group is None or group.attrs.get("format") != FORMAT:
             raise ModelError(

@@ -15,12 +15,16 @@ from softgrasp.study.shell import Flags, Session, folder_lock
 
 def check_scene(scene: Scene) -> tuple[str, ...]:
     """Methods of the scene. Raises SceneError: it keeps no snapshots for a basis. BasisError: a method is unknown."""
-    scene.refuse_contact("a reduced model")
     if scene.output.snapshots not in ("auto", "memory"):
         raise SceneError(
             f"output.snapshots is '{scene.output.snapshots}'; it must be 'memory' for a reduction, which builds its "
             "bases from the states in memory"
         )
+    if scene.effects.obstacles:
+        from softgrasp.study.reduce.contact.run import check_contact  # models of another kind
+
+        check_contact(scene)
+        return ()
     if scene.effects.frame is not None:
         if scene.reduction.certify != "off" or scene.reduction.train == "greedy":
             scene.refuse_frame("a certified model")
@@ -46,6 +50,10 @@ def run_reduce(
     session = Session("reduce", path, overrides, out, console, **flags)
     scene = session.scene()
     names = check_scene(scene)
+    if scene.effects.obstacles:
+        from softgrasp.study.reduce.contact.run import run_contact
+
+        return run_contact(session, scene)
     if scene.reduction.certify != "off" or scene.reduction.train == "greedy":
         from softgrasp.study.reduce.certified.run import run_certify  # only certified models pay for it
 

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import total
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.reduction.contact.model import contact_model
+from softgrasp.reduction.contact.make import contact_model
 from softgrasp.reduction.contact.stepper import ContactSteps
 from softgrasp.reduction.system import ModelError
 

@@ -50,7 +50,7 @@ def test_forces_gaps_and_touching_nodes_are_in_the_files(tmp_path: Path) -> None
 
 def test_reduction_refuses_contact() -> None:
     model = build("paper_forward", SCENE)
-    with pytest.raises(SceneError, match=r"a reduced model cannot go with effects.obstacles yet"):
+    with pytest.raises(SceneError, match=r"sg.contact_model, cannot go with effects.obstacles yet"):
         reduce(model, simulate(model))
 
 

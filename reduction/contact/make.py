@@ -1,0 +1,182 @@
+"""Making of reduced models with contact: V = [K^-1 G, modes, K^-1 N'], orthonormal in the mass [CB68].
+
+On fine meshes rows of hat functions h_j over several nodes replace those of nodes: mean gaps are >= 0.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softgrasp.fem.model.outputs import make_outputs, output_columns
+from softgrasp.fem.model.surface import Surface, make_surface, node_distance
+from softgrasp.fem.obstacles import HalfSpace, Obstacle, make_obstacles
+from softgrasp.fem.petsc import Array, normalising, times_columns, total
+from softgrasp.fem.run.midpoint import viscosity
+from softgrasp.fem.run.motion import HandTable, motion_table
+from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.fem.solve.stiffness import static_columns
+from softgrasp.reduction.contact.model import ContactModel, Ints, plane
+from softgrasp.reduction.origin import origin_of
+from softgrasp.reduction.system import ModelError
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
+
+DEPENDENT = 1e-13  # least share of a direction of the basis in its Gram matrix, scaled [1]
+CROWD = 1.5  # power of the distance from the end by which hat functions crowd there, where pressures are steep [1]
+
+
+def contact_model(model: Model, modes: int = 10, reach: float | None = None, rows: int | None = None) -> ContactModel:
+    """The tissue in coordinates z = V a, V = [K^-1 G, modes, K^-1 N'] orthonormal in the mass [CB68]. Collective.
+
+    Args:
+        model: with ``effects.obstacles`` and a hand that does not feel the tissue.
+        modes: number of clamped modes beside the responses.
+        reach: rows N are kept for boundary nodes that come nearer than this to an obstacle while the undeformed body
+            follows the hand of the scene [m]; None: half the distance of boundary nodes. A run in which another node
+            enters an obstacle is refused.
+        rows: number of hat functions along each half-space in 2D, at least 2, whose mean gaps are >= 0, for N that does
+            not grow with the mesh; None: a row for each node. Of nodes behind each other the foremost is in them.
+
+    Raises:
+        ModelError: the scene has other obstacles, no contact or a two-way hand, or no node comes within reach.
+
+    >>> import softgrasp as sg
+    >>> rom = sg.contact_model(sg.build("set_down", ["tissue.cells=[6, 4]"]), modes=8)
+    >>> run = rom.run(*rom.motion(), rom.dt)
+    >>> rom.N, bool(run.gap.min() > -1e-12)
+    (17, True)
+    """
+    scene, system = model.scene, model.system
+    layout, obstacles = system.layout, check_contact_scene(model)
+    seconds, begin = {}, time.perf_counter()
+    surface, table, dt = (
+        make_surface(model.space, system),
+        motion_table(scene, layout.n_s),
+        scene.time_end / scene.time.steps,
+    )
+    near = node_distance(model.space) / 2 if reach is None else reach
+    kept = np.flatnonzero(_nearest(surface, obstacles, table, dt) < near)
+    if not len(kept):
+        raise ModelError(f"no boundary node comes within reach = {near:.3g} m of an obstacle; give a larger reach")
+    if rows is not None:  # a hat goes along one face: of what lies above another node none
+        kept = _foremost(surface.X, kept, obstacles, near)
+    hats = tuple(_hats(surface, kept, o, rows) for o in obstacles)
+    loads = _responses(model, surface, kept, obstacles, hats)
+    blocks = [static_columns(system, np.asfortranarray(np.hstack([system.G, loads]))), lowest_modes(system, modes)[1]]
+    V, stiffness = _diagonal(model, np.hstack(blocks))
+    seconds["basis"] = time.perf_counter() - begin
+    begin = time.perf_counter()
+    viscous = viscosity(system, 1.0)
+    D = total(layout.comm, V.T @ times_columns(viscous, V))
+    viscous.destroy()
+    outputs = make_outputs(scene, system)
+    on = np.zeros((len(surface.dofs), V.shape[1]))
+    on[surface.mine] = V[surface.rows]
+    seconds["projection"] = time.perf_counter() - begin
+    return ContactModel(
+        stiffness, (D + D.T) / 2, total(layout.comm, V.T @ system.G),
+        total(layout.comm, output_columns(outputs, layout.n_local).T @ V), np.vstack([o.C_s for o in outputs]),
+        surface.X, surface.T, total(layout.comm, on), kept, hats, obstacles, system.fall, system.damping.drag,
+        scene.time.start == "equilibrium" and system.gravity is not None, table, dt, layout.extent,
+        tuple(name for o in outputs for name in o.names), model.scene_hash, origin_of(model.scene_keys), seconds,
+        layout, V,
+    )  # fmt: skip
+
+
+def check_contact_scene(model: Model) -> tuple[Obstacle, ...]:
+    """The half-spaces of its scene. Raises ModelError: a contact model cannot be made of it."""
+    scene = model.scene
+    if not scene.effects.obstacles or scene.effects.reaction or scene.motion.drive == "force":
+        raise ModelError("contact_model needs effects.obstacles, motion.drive = 'motion' and effects.reaction = false")
+    if scene.effects.finite_strain is not None:
+        raise ModelError("contact_model is linear; use effects.finite_strain = false for the linear law")
+    if any(entry.friction for entry in scene.obstacle or []):
+        raise ModelError("contact_model has no friction yet; leave out the friction of every obstacle")
+    obstacles = make_obstacles(scene, model.system.layout.dimension)
+    if other := [o.kind for o in obstacles if not isinstance(o.shape, HalfSpace)]:
+        raise ModelError(f"contact_model keeps half-spaces, whose normals do not turn, and no {other[0]}")
+    return obstacles
+
+
+def reachable(model: Model) -> tuple[int, int]:
+    """Boundary nodes within the reach of :func:`contact_model`, and different normals of half-spaces. Collective."""
+    scene, layout = model.scene, model.system.layout
+    obstacles = check_contact_scene(model)
+    table, dt = motion_table(scene, layout.n_s), scene.time_end / scene.time.steps
+    least = _nearest(make_surface(model.space, model.system), obstacles, table, dt)
+    normals = {tuple(plane(o)[0].tolist()) for o in obstacles}
+    return int((least < node_distance(model.space) / 2).sum()), len(normals)
+
+
+def _nearest(surface: Surface, obstacles: tuple[Obstacle, ...], table: HandTable, dt: float) -> Array:
+    """Least gap of each boundary node while the undeformed body follows the hand, (p,) [m]."""
+    least = np.full(len(surface.X), np.inf)
+    for n, q in enumerate(table.q):
+        x = surface.places(q)
+        for obstacle in obstacles:
+            least = np.minimum(least, obstacle.gap(x, n * dt))
+    return least
+
+
+def _foremost(X: Array, kept: Ints, obstacles: tuple[Obstacle, ...], distance: float) -> Ints:
+    """The kept nodes with no other one straight before them at rest, towards the obstacle that is nearest to them."""
+    gaps = np.array([o.gap(X[kept]) for o in obstacles])
+    first = np.ones(len(kept), dtype=bool)
+    for j, o in enumerate(obstacles):
+        n, mine = plane(o)[0], gaps.argmin(axis=0) == j
+        beside = X[kept] - gaps[j][:, None] * n
+        before = gaps[j][None, :] < gaps[j][:, None] - distance
+        close = np.linalg.norm(beside[:, None] - beside[None], axis=2) < distance
+        first &= ~(mine & (before & close).any(axis=1))
+    return kept[first]
+
+
+def _hats(surface: Surface, kept: Ints, obstacle: Obstacle, rows: int | None) -> Array:
+    """Shares of the kept nodes in the rows of a half-space, (rows, nodes) [1].
+
+    Raises ModelError: rows is less than 2, or the tissue is 3D.
+    """
+    if rows is None:
+        return np.eye(len(kept))
+    if surface.X.shape[1] == 3 or rows < 2:
+        raise ModelError(f"rows = {rows}; it must be at least 2, and in 3D every node has a row: leave it out")
+    n = plane(obstacle)[0]
+    x = surface.X[kept] @ np.array([-n[1], n[0]])
+    s = np.linspace(-1.0, 1.0, rows)
+    even = (1 + np.sign(s) * (1 - (1 - np.abs(s)) ** CROWD)) / 2
+    at = np.unique(x[np.abs(x[:, None] - (x.min() + np.ptp(x) * even)).argmin(axis=0)])  # where nodes are
+    H = np.array([np.interp(x, at, unit) for unit in np.eye(len(at))])
+    return np.asarray(H / H.sum(axis=1, keepdims=True))
+
+
+def _responses(
+    model: Model, surface: Surface, kept: Ints, obstacles: tuple[Obstacle, ...], hats: tuple[Array, ...]
+) -> Array:
+    """N' of the rows, those of equal half-spaces once, local rows (n_local, columns)."""
+    d = surface.X.shape[1]
+    normals = [plane(o)[0] for o in obstacles]
+    each = [j for j, n in enumerate(normals) if not any(np.array_equal(n, other) for other in normals[:j])]
+    whole = np.zeros((len(surface.dofs), sum(len(hats[j]) for j in each)))
+    loads = np.hstack([np.einsum("ri,d->idr", hats[j], normals[j]).reshape(len(kept) * d, -1) for j in each])
+    whole[(kept[:, None] * d + np.arange(d)).ravel()] = loads
+    result = np.zeros((model.system.layout.n_local, whole.shape[1]), order="F")
+    result[surface.rows] = whole[surface.mine]
+    return result
+
+
+def _diagonal(model: Model, X: Array) -> tuple[Array, Array]:
+    """V of the span of X with V'M V = I and V'K V diagonal, and that diagonal. Collective."""
+    system, comm = model.system, model.system.layout.comm
+    X = np.asfortranarray(X)
+    gram = total(comm, X.T @ times_columns(system.M_ee, X))
+    X = np.asfortranarray(X / np.sqrt(gram.diagonal()))
+    V = X
+    for share in (DEPENDENT, 0.0):  # twice, for orthonormality to rounding
+        V = np.asfortranarray(V @ normalising(total(comm, V.T @ times_columns(system.M_ee, V)), share))
+    K = total(comm, V.T @ times_columns(system.K_ee, V))
+    stiffness, vectors = np.linalg.eigh((K + K.T) / 2)
+    return np.asfortranarray(V @ vectors), stiffness

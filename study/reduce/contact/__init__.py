@@ -1,0 +1,1 @@
+"""Reduced models with contact: `softgrasp reduce` of scenes with effects.obstacles."""
