@@ -65,14 +65,13 @@ def galerkin_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Reconstruc
     return parts | own_loads(system, W), Reconstruction(system.layout, Z, Z_v)
 
 
-def galerkin_system(name: str, parts: Parts, p: Parameters, outputs: Outputs, second_order: bool) -> EnergySystem:
-    """The system at one parameter; online. ``second_order``: the basis keeps the equations of second order."""
-    S_q, S_v, M_hand = parts["S_q"], parts["S_v"], parts["M_hand"]
+def galerkin_equations(parts: Parts, p: Parameters) -> tuple[Array, Array, Array]:
+    """E, A and f at one parameter; online. They are affine in lambda, mu, rho, alpha and beta (lambda, mu)."""
+    S_v, M_hand = parts["S_v"], parts["M_hand"]
     G, rigid = p.density(parts["WG"]), p.density(parts["rigid"])
-    Z_G = p.density(parts["ZG"])
     M = p.density(parts["M"]) + G @ S_v
     if p.two_way:
-        M += S_v.T @ (Z_G.T + rigid @ S_v)
+        M += S_v.T @ (p.density(parts["ZG"]).T + rigid @ S_v)
     A = parts["identity_A"] - p.stiffness(parts["K_mu"], parts["K_lambda"])
     if p.damped:
         A -= p.viscosity(parts["D_mu"], parts["D_lambda"])
@@ -81,15 +80,22 @@ def galerkin_system(name: str, parts: Parts, p: Parameters, outputs: Outputs, se
     own = p.own_load(parts, "own_tissue")
     if p.two_way and "own_hand" in parts:
         own = own + S_v.T @ p.own_load(parts, "own_hand")
+    return parts["identity_E"] + S_v.T @ M_hand @ S_v + M, A, p.load(F) + own
+
+
+def galerkin_system(name: str, parts: Parts, p: Parameters, outputs: Outputs, second_order: bool) -> EnergySystem:
+    """The system at one parameter; online. ``second_order``: the basis keeps the equations of second order."""
+    S_q, S_v = parts["S_q"], parts["S_v"]
+    E, A, f = galerkin_equations(parts, p)
     energy = symmetric(p.stiffness(parts["energy_mu"], parts["energy_lambda"]) + p.density(parts["energy_M"]))
-    cross = Z_G @ S_v
-    hand = M_hand + rigid if p.two_way else M_hand
+    cross = p.density(parts["ZG"]) @ S_v
+    hand = parts["M_hand"] + p.density(parts["rigid"]) if p.two_way else parts["M_hand"]
     return EnergySystem(
-        parts["identity_E"] + S_v.T @ M_hand @ S_v + M,
+        E,
         A,
         S_v.T.copy(),
         outputs.C_z + outputs.C_s @ S_q,
-        p.load(F) + own,
+        f,
         S_q,
         S_v,
         outputs.names,

@@ -13,7 +13,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.shown import Card, Shown, drawn, listed
 from softgrasp.reduction.bases.basis import Coordinates, Frame, Structure
 from softgrasp.reduction.canonical import canonical_system
-from softgrasp.reduction.galerkin import galerkin_system
+from softgrasp.reduction.galerkin import galerkin_equations, galerkin_system
 from softgrasp.reduction.operators import Parameters, Parts, Reconstruction
 from softgrasp.reduction.system import EnergySystem, ModelError, Outputs
 
@@ -139,6 +139,13 @@ class ReducedModel(Shown):
         if self.coordinates == "qv":
             return galerkin_system(self.name, self.parts, p, self.outputs, self.structure == "second_order")
         return canonical_system(self.name, self.parts, p, self.outputs, self.fixed_solid, self.frame == "absolute")
+
+    def equations(self, p: Parameters) -> tuple[Array, Array, Array]:
+        """E, A and f of :meth:`assemble` alone. Online; not collective."""
+        if self.coordinates == "qv":
+            return galerkin_equations(self.parts, p)
+        system = self.assemble(p)
+        return system.E, system.A, system.f
 
     def parameters(self, materials: tuple[LayerMaterial, ...], gravity: Array | None = None) -> Parameters:
         """Check materials and bundle them with the effects of the scene.

@@ -61,7 +61,10 @@ class Backward:
             self.Y = self.midpoint.Y  # which the run made
             GY = self._over_ranks(self.G.T @ self.Y)
             self.L = system.M_hand + self.kappa * (system.M_rigid - self.theta * (GY + GY.T) / 2)
-        self.rtol = run.midpoint.solver.ksp.getTolerances()[0] if run.solver.name in ITERATIVE else None
+        if run.solver.name in ITERATIVE:
+            ksp = run.midpoint.solver.ksp
+            ksp.setTolerances(rtol=min(TIGHT, ksp.getTolerances()[0]))
+        self._check = True  # the first solve of the way back
         self.Z, self.V = self.C @ r[self.n], np.zeros(len(self.C))
         self.p, self.m = C_s.T @ r[self.n], np.zeros(n_s)
         self.xi, self.pulls = np.zeros((self.n, n_s)), np.zeros((self.n, n_s))
@@ -76,28 +79,20 @@ class Backward:
         States are [z; v], local rows (2 n_local, steps + 1), costates eta those of the owned rows (n_local, steps).
         Raises SolverError: a solve fails or misses its tolerance.
         """
-        n_e, (least, most) = self.system.layout.n_e, BLOCK_STEPS
+        n_e, (least, most), Z = self.system.layout.n_e, BLOCK_STEPS, self.run.all_states.Z
         block = int(np.clip(BLOCK_ENTRIES // n_e, least, most))  # the same on every rank
         eta = np.zeros((self.system.layout.n_local, block), order="F")
-        for number in reversed(range(-(-self.n // self.run.length))):
-            first, states = self.run.states_from(number)
-            self._check = True  # the way forward has used the vectors since
-            end = first + states.shape[1] - 1
-            for last in range(end, first, -block):
-                begin = max(first, last - block)
-                for n in range(last - 1, begin - 1, -1):
-                    eta[:, n - begin] = self._step(n)
-                yield begin, states[:, begin - first : last - first + 1], eta[:, : last - begin]
+        for last in range(self.n, 0, -block):
+            begin = max(0, last - block)
+            for n in range(last - 1, begin - 1, -1):
+                eta[:, n - begin] = self._step(n)
+            yield begin, Z[:, begin : last + 1], eta[:, : last - begin]
 
     def _solve(self, b: Array) -> Array:
         """S^-1 b on the rows here, a view that the next solve overwrites; the first is checked. Collective."""
         midpoint = self.midpoint
         midpoint.r.array_w[:] = b
-        if self.rtol is not None:
-            midpoint.solver.ksp.setTolerances(rtol=min(TIGHT, self.rtol))
         midpoint.solver.solve(midpoint.r, midpoint.w)
-        if self.rtol is not None:  # segments are run again as before
-            midpoint.solver.ksp.setTolerances(rtol=self.rtol)
         if self._check:
             self._check = False
             with self.operators.raise_on_all_ranks():

@@ -1,4 +1,4 @@
-"""J of the outputs of a full run and its derivatives, for two to four runs whatever their number."""
+"""J of the outputs of a full run and its derivatives, for two to three runs whatever their number."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ def full_gradient(
     force: Array | None = None,
     hand: tuple[Array, Array] | None = None,
     materials: tuple[LayerMaterial, ...] | None = None,
-    segment: int | None = None,
 ) -> RunGradient[Trajectory]:
     """J and its derivatives by the adjoint of the midpoint rule, see :mod:`softgrasp.fem.adjoint.backward`. Collective.
 
@@ -37,19 +36,17 @@ def full_gradient(
         force: u on the hand at the step midpoints, (steps, n_s) [N, N m], in place of the scene's.
         hand: q_s and v_s of a prescribed hand, (steps + 1, n_s) each, in place of the scene's.
         materials: one a layer; None: those of the model.
-        segment: steps whose states are kept at once; None: all where memory allows, else about sqrt(steps), for one
-            more run.
 
     Raises:
         SceneError: effects.finite_strain or effects.obstacles is on, or tables or dJ/dy do not fit.
-        ResourceError: the states do not fit in memory.
+        ResourceError: the states fit neither in memory nor on the disk of temporary files.
         SolverError: a solve fails or misses its tolerance.
     """
-    model = _checked(model, materials, segment)
+    model = _checked(model, materials)
     hand, force = checked_tables(model, hand, force)
     driven = hand is not None or (force is None and model.scene.motion.drive == "motion")
     system, comm, outputs = model.system, model.system.layout.comm, model.outputs
-    run = KeptRun(model, hand, force, segment)
+    run = KeptRun(model, hand, force)
     try:
         answer = run.whole()
         value, r = on_root(comm, lambda: _value(loss, answer.outputs))
@@ -76,7 +73,7 @@ def full_gradient(
     )  # fmt: skip
 
 
-def _checked(model: Model, materials: tuple[LayerMaterial, ...] | None, segment: int | None) -> Model:
+def _checked(model: Model, materials: tuple[LayerMaterial, ...] | None) -> Model:
     """The model at the materials. Raises SceneError: it has no adjoint, or an argument does not fit."""
     scene = checked_model(model).scene
     scene.refuse_contact("a gradient")
@@ -86,14 +83,11 @@ def _checked(model: Model, materials: tuple[LayerMaterial, ...] | None, segment:
             f"scene '{scene.name}': a gradient is by lambda, mu, rho and beta, and cannot go with tissue.energy or own "
             "terms yet"
         )
-    scene.refuse_frame("a gradient")
     if scene.effects.finite_strain is not None:
         raise SceneError(
             f"scene '{scene.name}': a gradient needs linear elasticity, and effects.finite_strain is on; use --set "
             "effects.finite_strain=false"
         )
-    if segment is not None and segment < 1:
-        raise SceneError(f"segment = {segment} must be a number of steps, at least 1")
     if materials is None:
         return model
     if len(materials) != len(model.system.layers):

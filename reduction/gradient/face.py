@@ -38,7 +38,6 @@ def gradient(
     force: Array | None = None,
     hand: tuple[Array, Array] | None = None,
     materials: tuple[LayerMaterial, ...] | None = None,
-    segment: int | None = None,
 ) -> RunGradient[Trajectory]: ...
 
 
@@ -51,14 +50,13 @@ def gradient(
     hand: tuple[Array, Array] | None = None,
     materials: tuple[LayerMaterial, ...] | None = None,
     x0: Array | Literal["equilibrium"] | None = None,
-    segment: int | None = None,
 ) -> RunGradient[ReducedTrajectory] | RunGradient[Trajectory]:
     """J(y) of a run and all its derivatives by the adjoint, the midpoint rule backwards [HLW06].
 
         (E - h/2 A)' l_n = C' r_{n+1} + (E + h/2 A)' l_{n+1},   dJ/dtheta = sum_n h l_n' A_theta x_{n+1/2} ..
 
     Of a full model the transposed step has the matrix of the step, which is symmetric, and its factor. Either costs
-    two to three runs whatever the number of derivatives, up to four in segments.
+    two to three runs whatever the number of derivatives.
     Collective for a full model; not for a reduced one.
 
     >>> import numpy as np, softgrasp as sg
@@ -81,22 +79,20 @@ def gradient(
         materials: one a layer; None: those of the model.
         x0: initial state (N,) of a reduced run, or "equilibrium", that under gravity, which moves with the materials;
             None is zero. A full run starts as its scene says.
-        segment: steps of a full run whose states are kept at once; None: all where half of the free memory holds them,
-            else about sqrt(steps), and the run is made once more in segments [GW00].
 
     Raises:
         ModelError: arguments are those of the other kind of model, or shapes do not fit.
         UnstableModelError: the reduced model has growing modes there.
         SceneError: the full model has finite strain or obstacles, or shapes do not fit.
-        ResourceError: the states of the full run do not fit in memory.
+        ResourceError: the states of the full run fit neither in memory nor on the disk of temporary files.
         SolverError: a solve of the full run fails.
     """
     if isinstance(model, ReducedModel):
-        if dt is None or segment is not None:
-            raise ModelError("the gradient of a reduced model needs the step dt [s] and has no segments")
+        if dt is None:
+            raise ModelError("the gradient of a reduced model needs the step dt [s]")
         return reduced_gradient(model, loss, dt, force=force, hand=hand, materials=materials, x0=x0)
     from softgrasp.fem.adjoint.full import full_gradient  # only full models pay for it
 
     if dt is not None or x0 is not None:
         raise ModelError("the gradient of a full model has the steps and the start of its scene; leave out dt and x0")
-    return full_gradient(model, loss, force=force, hand=hand, materials=materials, segment=segment)
+    return full_gradient(model, loss, force=force, hand=hand, materials=materials)

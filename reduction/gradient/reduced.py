@@ -23,6 +23,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.reduced import MidpointSteps
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory, run
+from softgrasp.reduction.operators import Parameters
 from softgrasp.reduction.system import EnergySystem, ModelError
 
 
@@ -78,13 +79,13 @@ def reduced_gradient(
         slope_a[hands - rows.start :] -= np.outer(zeta, x[0])
         slope_f[hands - rows.start :] -= zeta
 
-    def along(other: EnergySystem) -> float:
-        """sum_ij dJ/dA_ij (A_ij of another system less ours), and so on."""
-        return float(
-            (slope_a * (other.A - system.A)[rows]).sum()
-            + (slope_e * (other.E - system.E)[rows]).sum()
-            + slope_f @ (other.f - system.f)[rows]
-        )
+    p = rom.parameters(materials)
+
+    def along(changed: Parameters) -> float:
+        """sum_ij dJ/dA_ij (A_ij at other parameters less ours), and so on."""
+        E, A, f = rom.equations(changed)
+        by_a, by_e = np.vdot(slope_a, (A - system.A)[rows]), np.vdot(slope_e, (E - system.E)[rows])
+        return float(by_a + by_e + slope_f @ (f - system.f)[rows])
 
     def of(key: str) -> Array:
         """By one constant of each layer; the matrices are affine in it, so that any step is exact."""
@@ -92,7 +93,8 @@ def reduced_gradient(
         for i, m in enumerate(materials):
             step = {"lam": abs(m.lam) + m.mu, "beta": 1.0}.get(key) or getattr(m, key)
             changed = replace(m, **{key: getattr(m, key) + step})
-            result[i] = along(rom.at((*materials[:i], changed, *materials[i + 1 :]))) / step
+            others = (*materials[:i], changed, *materials[i + 1 :])
+            result[i] = along(replace(p, materials=others)) / step
         return result
 
     return RunGradient(
@@ -102,7 +104,7 @@ def reduced_gradient(
         mu=of("mu"),
         beta=of("beta") if rom.damped else None,
         rho=of("rho") if rom.coordinates == "qv" else None,
-        alpha=along(replace(rom, alpha=rom.alpha + 1.0).at(materials)) if rom.damped else None,
+        alpha=along(replace(p, alpha=p.alpha + 1.0)) if rom.damped else None,
         start=start,
         force=dt * costate @ system.B if hand is None else None,
         hand=None if hand is None else _hand(system, rows, r, costate, dt),
@@ -111,14 +113,9 @@ def reduced_gradient(
 
 def adjoint(system: EnergySystem, rows: slice, r: Array, dt: float) -> Array:
     """l_n of all steps in some rows, (steps, rows), for r = dJ/dy (steps + 1, p)."""
-    E, A, C = system.E[rows, rows], system.A[rows, rows], system.C[:, rows]
-    left, right = E - dt / 2 * A, E + dt / 2 * A
-    turn, loads = np.linalg.solve(left, right).T, r @ C
-    m = np.zeros((len(r), len(E)))  # left' l; that behind the last step is zero
-    for n in range(len(r) - 2, -1, -1):
-        np.dot(turn, m[n + 1], out=m[n])
-        m[n] += loads[n + 1]
-    return np.asarray(np.linalg.solve(left.T, m[:-1].T).T)
+    E, A, C = system.E[rows, rows].T, system.A[rows, rows].T, system.C[:, rows].T
+    back = MidpointSteps(dt, E, A, np.hstack([C / dt, np.zeros((len(C), 1))]))
+    return back.march(r[:0:-1], np.zeros(len(E)))[:0:-1]
 
 
 def _start(system: EnergySystem, rows: slice, r: Array, costate: Array, dt: float) -> Array:

@@ -24,15 +24,17 @@ SOLVERS = {
 
 
 @pytest.mark.parametrize("keys", SOLVERS.values(), ids=SOLVERS)
-def test_gradients_are_differences_of_runs(keys: list[str]) -> None:
+def test_gradients_are_differences_of_runs(keys: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     model = sg.build("paper_forward", [*KEYS, DAMPED, *keys])
     run = sg.simulate(model)
 
     def loss(y: Any) -> Any:
         return ((y - 0.9 * run.outputs) ** 2).sum() / 2, y - 0.9 * run.outputs
 
-    found = sg.gradient(model, loss, segment=3)
-    np.testing.assert_allclose(found.run.outputs, run.outputs, rtol=0, atol=1e-10)  # segments of the solves apart
+    if len(keys) > 1:  # states in a file of each rank
+        monkeypatch.setattr("softgrasp.fem.adjoint.forward.free_memory", lambda: 1)
+    found = sg.gradient(model, loss)
+    np.testing.assert_allclose(found.run.outputs, run.outputs, rtol=0, atol=1e-10)  # the tolerance of iterative solves
     (m,) = model.system.materials
     keys_of = ("mu", "rho", "beta")
     ends = []
