@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.obstacles.compiled import HEADER, RIDGE
+from softgrasp.fem.obstacles.compiled import HEADERS, RIDGE
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.strain.compiled import library
 
@@ -50,7 +50,7 @@ class CompiledStep:
         code = SOURCE.read_text()
         struct = code[code.index("typedef struct {") : code.index("} Tissue;")] + "} Tissue;\n"
         otherwise = "tissue in MuJoCo is stepped in NumPy, more slowly"
-        compiled = library(SOURCE, struct + FUNCTIONS, otherwise, HEADER, (f"RIDGE={RIDGE!r}",))
+        compiled = library(SOURCE, struct + FUNCTIONS, otherwise, HEADERS, (f"RIDGE={RIDGE!r}",))
         return None if compiled is None else cls(compiled, tissue)
 
     def _at(self, values: Any, kind: str = "double") -> Any:
