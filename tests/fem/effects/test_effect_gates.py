@@ -62,7 +62,9 @@ def test_gravity() -> None:
     assert not EFFECTS["gravity"].gate(problem_of(on, sag=weak)).matters, "steep at the edge of the contact zone only"
     steep = Sag((3.0, -4.0), 1.0, Gradient(0.5, 0.3, 0.25, 0.2))
     assert "does not hold, 25 % of the body" in EFFECTS["gravity"].gate(problem_of(on, sag=steep)).sentence
-    falling = scene_of(effects={"gravity": {"g": [0.0, -1.0], "hand_weight": True}}, motion={"profile": "hold", "drive": "force"})
+    falling = scene_of(
+        effects={"gravity": {"g": [0.0, -1.0], "hand_weight": True}}, motion={"profile": "hold", "drive": "force"}
+    )
     gate = EFFECTS["gravity"].gate(problem_of(falling, sag=weak))
     assert gate.matters
     assert "pulls on the hand" in gate.sentence
