@@ -102,7 +102,9 @@ def steps_of(scene: Scene, n: int, dimension: int, ranks: int) -> Work:
     refine, damped = scene.tissue.refine, scene.effects.damping is not None
     graded = refine is not None and refine.grading != "off"
     order, bits = scene.tissue.order, time.reproducible
-    return Work(n, dimension, order, ranks, time.steps, False, contrast, bits, graded, damped)
+    effects = scene.effects
+    linear = effects.finite_strain is None and effects.frame is None and not effects.obstacles
+    return Work(n, dimension, order, ranks, time.steps, False, contrast, bits, graded, damped, linear)
 
 
 def free_bytes(scene: Scene) -> float:

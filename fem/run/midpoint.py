@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -99,6 +99,9 @@ class TissueMidpoint:
         x: the rows of w that this rank owns, in the order of the state; w itself unless the vectors are whole here.
     """
 
+    SUBTREES: ClassVar[bool] = True
+    """Whether linear steps ask nothing but solves of the factor, so that each rank may store a subtree."""
+
     def __init__(
         self,
         system: BlockSystem,
@@ -108,14 +111,16 @@ class TissueMidpoint:
         reproducible: Reproducible = "auto",
     ) -> None:
         self.system, self.dt, self.s = system, dt, 2 / dt
-        whole, ordered = factor_on_every_rank(system.layout, solver, reproducible), solver == "cholesky"
+        linear = self.SUBTREES and system.points is None and system.frame is None
+        whole = factor_on_every_rank(system.layout, solver, reproducible, linear)
+        ordered = solver == "cholesky" and whole
         self.operators = replicated_operators(system, midpoint_matrix(system, dt), whole, ordered, self._parts())
         self.G, self.rows = self.operators.G, self.operators.rows
         self.K2 = self.operators.K
         self.K2.scale(-2.0)
         with self.operators.raise_on_all_ranks():
             self.solver: TissueSolver = make_solver(
-                self.operators.S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible, ordered
+                self.operators.S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible, ordered, not whole
             )
         self._solve = self.solver.solve if self.solver.factor is None else self.solver.factor.solve
         self.r, self.k, self.w = (self.K2.createVecLeft() for _ in range(3))

@@ -30,11 +30,11 @@ class NodeOrder:
 
     def enter(self, x: NDArray[Any]) -> NDArray[Any]:
         """Rows (n, ...) in this order, a copy."""
-        return x[_rows(self.nodes, self.d)]
+        return x[rows_of(self.nodes, self.d)]
 
     def leave(self, x: NDArray[Any]) -> NDArray[Any]:
         """Rows (n, ...) of this order as they were before, a copy."""
-        return x[_rows(self.places, self.d)]
+        return x[rows_of(self.places, self.d)]
 
     def places_of(self, first: int, last: int) -> NDArray[np.intp]:
         """Places of the nodes that had the rows from first to before last."""
@@ -42,7 +42,7 @@ class NodeOrder:
 
     def rows_of(self, first: int, last: int) -> NDArray[np.intp]:
         """Where the rows from first to before last are now."""
-        return _rows(self.places_of(first, last), self.d)
+        return rows_of(self.places_of(first, last), self.d)
 
 
 @dataclass(frozen=True)
@@ -74,11 +74,7 @@ def dissect(A: PETSc.Mat, d: int) -> Dissection:
     before = blocks.indptr, blocks.indices
     count = len(blocks.indices)
     size = (len(blocks.indptr) - 1,) * 2
-    graph = PETSc.Mat().createAIJ(size, csr=(*before, np.ones(count)), comm=PETSc.COMM_SELF)
-    by_row, by_column = graph.getOrdering("nd")
-    nodes = by_row.getIndices().astype(np.intp)
-    for item in (by_row, by_column, graph):
-        item.destroy()
+    nodes = nested_dissection(*before)
     numbered = scipy.sparse.csr_matrix((np.arange(count), blocks.indices, blocks.indptr), shape=size)
     moved = numbered[nodes][:, nodes]
     moved.sort_indices()
@@ -86,7 +82,19 @@ def dissect(A: PETSc.Mat, d: int) -> Dissection:
     return Dissection(NodeOrder(nodes, np.argsort(nodes), d), before, after, moved.data)
 
 
-def _rows(nodes: NDArray[np.intp], d: int) -> NDArray[np.intp]:
+def nested_dissection(indptr: NDArray[Any], indices: NDArray[Any]) -> NDArray[np.intp]:
+    """Nodes of a graph on one rank in the order of nested dissection, by its symmetric pattern."""
+    size = (len(indptr) - 1,) * 2
+    graph = PETSc.Mat().createAIJ(size, csr=(indptr, indices, np.ones(len(indices))), comm=PETSc.COMM_SELF)
+    by_row, by_column = graph.getOrdering("nd")
+    nodes: NDArray[np.intp] = by_row.getIndices().astype(np.intp)
+    for item in (by_row, by_column, graph):
+        item.destroy()
+    return nodes
+
+
+def rows_of(nodes: NDArray[np.intp], d: int) -> NDArray[np.intp]:
+    """Rows of nodes with d rows each."""
     return (nodes[:, None] * d + np.arange(d)).ravel()
 
 
@@ -123,8 +131,8 @@ def factor_blocks(P: PETSc.Mat, prefix: str, entries: Literal["petsc", "mumps"] 
     return ksp
 
 
-def backward_error(S: PETSc.Mat, ksp: PETSc.KSP) -> float:
-    """Return |D^-1 (r - S w)| / (|D w| + |D^-1 r|) with D^2 = diag S, for the w that the solver finds [1].
+def backward_error(S: PETSc.Mat, solver: Any) -> float:
+    """Return |D^-1 (r - S w)| / (|D w| + |D^-1 r|) with D^2 = diag S, for the w that ``solver.solve(r, w)`` finds [1].
 
     What it solved exactly is S with errors of this size, counted in units in which the diagonal is one, and so free of
     the scaling of rows [VDS69]. The larger value of two r: D g lets soft parts answer most, S D^-1 g all parts alike,
@@ -144,7 +152,7 @@ def backward_error(S: PETSc.Mat, ksp: PETSc.KSP) -> float:
             r.pointwiseDivide(r, D)
             S.mult(r, y)
             y.copy(r)
-        ksp.solve(r, w)
+        solver.solve(r, w)
         S.mult(w, y)
         y.aypx(-1.0, r)
         y.pointwiseDivide(y, D)

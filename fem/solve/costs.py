@@ -37,9 +37,12 @@ ENTRIES = {(2, 1): 14, (2, 2): 23, (2, 3): 34, (2, 4): 46, (3, 1): 40, (3, 2): 7
 PER_ENTRY = 1e-9  # time of an entry in a product [s]
 # Unknowns times ranks up to which every rank stores the whole factor of MUMPS, and ranks. On two ranks a spread one
 # needs 0.68 and 0.65 of the time for solve and set-up at 2e4 unknowns in 3D; a whole one on each 1.4 and 1.2, and the
-# memory of one for each, the price of the same bits. In 2D blocks on every rank beat any spread factor to 2e5.
+# memory of one for each, the price of the same bits. In 2D blocks on every rank beat MUMPS.
 REPEATED_LIMIT = {2: 1_000_000, 3: 40_000}
 REPEATED_RANKS = 4
+# Unknowns from which ranks factor a subtree each in 2D: a solve with 1e5 takes 6.9 ms on two ranks, 11.3 on one, and
+# 12.7 where both have the whole factor; below, the messages and the sum of a step take as long.
+SUBTREES_FROM = 10_000
 
 
 @dataclass(frozen=True)
@@ -57,10 +60,11 @@ class Cost:
 
 # By solver, dimension and whether the order is 2 or more. Messages of iterations are counted on 2 to 8 ranks, those of
 # a factor guessed. Times of direct solvers follow their entries: n log n and
-# n^1.5 in 2D, n^(4/3) and n^2 in 3D, but for the caches; memory of factors is nnz(L) of factor_bytes.
+# n^1.5 in 2D, n^(4/3) and n^2 in 3D, but for the caches; memory of factors is nnz(L) of factor_bytes. With 4e5 unknowns
+# in 2D cholesky takes 4.9 s and 60 ms, MUMPS 2.7 s and 121 ms; beyond it was not measured.
 COSTS: dict[tuple[SolverName, int, bool], Cost] = {
-    ("cholesky", 2, False): Cost((0.67, 1.5), (0.0127, 1.1), (800, 0.1), 2e5),
-    ("cholesky", 2, True): Cost((0.9, 1.5), (0.017, 1.1), (1000, 0.1), 2e5),
+    ("cholesky", 2, False): Cost((0.67, 1.5), (0.0127, 1.1), (800, 0.1), 5e5),
+    ("cholesky", 2, True): Cost((0.9, 1.5), (0.017, 1.1), (1000, 0.1), 5e5),
     ("mumps", 2, False): Cost((0.40, 1.25), (0.030, 0.97), (1000, 0.1), 4e6, fixed=0.033, messages=100),
     ("mumps", 2, True): Cost((0.55, 1.25), (0.035, 0.97), (1250, 0.1), 4e6, fixed=0.033, messages=100),
     ("cg", 2, False): Cost((0.25, 1.0), (0.006, 1.12), (600, 0.0), np.inf, iterations=(9, 9.6), messages=22),
@@ -90,6 +94,7 @@ class Work:
     reproducible: Reproducible = "auto"  # time.reproducible of the scene
     graded: bool = False  # whether cells crowd, so that they are flat and iterations more
     damped: bool = False  # whether steps are damped, so that the last solutions predict the next better
+    linear: bool = False  # whether they are linear steps without contact, whose factor may have a subtree on each rank
 
     def repeated(self, name: SolverName) -> bool:
         """Whether every rank factors by itself: no message in a solve, and the same bits in every run.
@@ -98,12 +103,17 @@ class Work:
         differ from run to run.
         """
         if name == "cholesky":
-            return True
+            return not self.split(name)
         if self.ranks == 1 or name in ITERATIVE:
             return False
         if self.reproducible != "auto":
             return bool(self.reproducible)
         return self.ranks <= REPEATED_RANKS and self.n * self.ranks <= REPEATED_LIMIT[self._kind]
+
+    def split(self, name: SolverName) -> bool:
+        """Whether each rank factors a subtree (`softgrasp.fem.solve.subtrees`)."""
+        few = 2 <= self.ranks <= REPEATED_RANKS and self.n >= SUBTREES_FROM
+        return name == "cholesky" and self.linear and self.dimension == 2 and few
 
     def memory(self, name: SolverName) -> float:
         """Modelled memory of set-up and factor over all ranks [byte]."""

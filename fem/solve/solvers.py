@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from softgrasp.fem.solve.costs import ITERATIVE as ITERATIVE
 from softgrasp.fem.solve.costs import Reproducible as Reproducible
 from softgrasp.fem.solve.costs import SolverName as SolverName
 from softgrasp.fem.solve.stars import Stars, factored
+from softgrasp.fem.solve.subtrees import SplitFactor, split_factor
 
 # Largest problem whose single entries PETSc's own Cholesky factors faster than MUMPS, where blocks lose digits.
 FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}  # 1: systems without a mesh
@@ -75,9 +76,14 @@ def work_of(layout: BlockLayout, solves: int, few: bool, contrast: float, reprod
     return Work(layout.n_e, layout.dimension, layout.order, layout.comm.size, solves, few, contrast, reproducible)
 
 
-def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: Reproducible) -> bool:
-    """Whether every rank factors by itself, see :meth:`softgrasp.fem.solve.costs.Work.repeated`."""
-    return work_of(layout, 1, False, 1.0, reproducible).repeated(solver)
+def factor_on_every_rank(
+    layout: BlockLayout, solver: SolverName, reproducible: Reproducible, linear: bool = False
+) -> bool:
+    """Whether every rank factors by itself, see :meth:`softgrasp.fem.solve.costs.Work.repeated`.
+
+    ``linear``: for linear steps without contact, which a subtree on each rank serves too.
+    """
+    return replace(work_of(layout, 1, False, 1.0, reproducible), linear=linear).repeated(solver)
 
 
 def package_of(pc: PETSc.PC) -> str:
@@ -95,8 +101,8 @@ class TissueSolver:
     S: PETSc.Mat  # symmetric positive definite matrix, (rows, rows) [N/m]
     tolerance: float  # largest relative residual that ``check`` accepts [1]
     # factor that solves without ``ksp``: whole on every rank, perhaps in an order of its own
-    # (softgrasp.fem.solve.cholesky), or that of one rank; None where the factor is spread or there is none
-    factor: PETSc.Mat | AskedSolver | OrderedFactor | None = None
+    # (softgrasp.fem.solve.cholesky), a subtree on each, or that of one rank; None: spread by MUMPS, or none
+    factor: PETSc.Mat | AskedSolver | OrderedFactor | SplitFactor | None = None
     stars: Stars | None = None  # preconditioner of solver "stars", which owns S; else None
 
     @property
@@ -228,7 +234,7 @@ class TissueSolver:
 
     def destroy(self) -> None:
         """Free solver and matrix. Collective."""
-        if isinstance(self.factor, OrderedFactor):
+        if isinstance(self.factor, OrderedFactor | SplitFactor):
             self.factor.destroy()
         self.ksp.destroy()
         if self.stars is not None:
@@ -245,6 +251,7 @@ def make_solver(
     rtol: float = 1e-10,
     reproducible: Reproducible = "auto",
     ordered: bool = False,
+    subtrees: bool = False,
 ) -> TissueSolver:
     """Factor S (or set up CG with GAMG). Collective.
 
@@ -254,12 +261,15 @@ def make_solver(
         rtol: relative tolerance of cg and stars.
         reproducible: see :func:`factor_on_every_rank`.
         ordered: cholesky, S on one rank: its rows are in the order of elimination already, in blocks (BAIJ).
+        subtrees: cholesky: a subtree on each rank, if blocks keep the digits and the user gave no options.
 
     Raises SolverError: the factorisation fails.
     """
     S.setOption(PETSc.Mat.Option.SPD, True)
     tolerance = max(DIRECT_RESIDUAL, 10 * rtol)
     if name == "cholesky":
+        if subtrees and (split := split_factor(S, prefix, layout.dimension)) is not None:
+            return TissueSolver(name, split.ksp, S, tolerance, split)
         return _cholesky(S, layout, prefix, tolerance, ordered)
     if name == "stars":
         return _stars(S, layout, prefix, rtol, tolerance)

@@ -27,9 +27,12 @@ SHARED = "shared factors"  # key of those in system.kept, by name with what they
 
 
 @contextmanager
-def sharing_factors(system: BlockSystem) -> Iterator[None]:
-    """Factors made inside stay with the system to the end of the block, of any size and on any ranks. Collective."""
-    if SHARED in system.kept:
+def sharing_factors(system: BlockSystem, large: bool = True) -> Iterator[None]:
+    """Factors made inside stay with the system to the end of the block, on any ranks. Collective.
+
+    ``large``: those of more than `KEPT_LIMIT` unknowns too.
+    """
+    if SHARED in system.kept or not (large or system.layout.n_e <= KEPT_LIMIT[system.layout.dimension]):
         yield
         return
     shared: dict[str, tuple[object, TissueSolver]] = {}

@@ -11,7 +11,18 @@ import numpy as np
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 
-from softgrasp.fem import EFFECTS, FRAMES, Model, check_ranks, counted, forecasts, frame_count, run_seconds, told
+from softgrasp.fem import (
+    EFFECTS,
+    FRAMES,
+    Model,
+    check_ranks,
+    counted,
+    forecasts,
+    frame_count,
+    run_seconds,
+    sharing_factors,
+    told,
+)
 from softgrasp.fem.accuracy.price import SHARE
 from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError, SolverError
 from softgrasp.fem.run.forecast import Forecast
@@ -57,7 +68,13 @@ def run_simulate(
         check_ranks(session.comm, out / "checkpoint")
     model = session.model(scene)
     model.system.release()
-    scene, frames, n_e = model.scene, Frames(model, out, session.pictures), model.system.layout.n_e
+    with sharing_factors(model.system, large=False):  # that of an equilibrium serves the estimate
+        return _run(session, model, resume=resume, until=until, certify=certify)
+
+
+def _run(session: Session, model: Model, *, resume: bool, until: int | None, certify: bool) -> dict[str, Any]:
+    scene, out, console, n_e = model.scene, session.out, session.console, model.system.layout.n_e
+    frames = Frames(model, out, session.pictures)
     for text in _announced(model):
         console.print(text, soft_wrap=True)
 

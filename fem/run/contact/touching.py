@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from softgrasp.fem.petsc import Array
@@ -12,6 +14,7 @@ from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 class Touching(TissueMidpoint):
     """What a step with contact does at its end; ``contact`` is set before the start, and None lets nothing touch."""
 
+    SUBTREES: ClassVar[bool] = False
     contact: Contact | None = None
 
     def advance(self, old: TissueState, new: TissueState) -> None:

@@ -70,6 +70,17 @@ def test_time_on_ranks() -> None:
     assert replace(small, ranks=1).seconds("cholesky") < small.seconds("mumps")
 
 
+def test_linear_steps_in_2d_have_a_subtree_on_each_rank() -> None:
+    work = Work(100_000, 2, 1, 2, 600, False, 1.0)
+    split, alone = replace(work, linear=True), replace(work, ranks=1)
+    assert work.repeated("cholesky")
+    assert not split.repeated("cholesky")
+    assert split.memory("cholesky") == work.memory("cholesky") / 2 == alone.memory("cholesky")
+    assert split.solve("cholesky") / alone.solve("cholesky") == pytest.approx(0.61, abs=0.05)  # measured
+    assert replace(split, n=5_000).repeated("cholesky")
+    assert replace(split, dimension=3).repeated("cholesky")
+
+
 def test_a_repeated_factor_costs_what_it_costs_on_one_rank() -> None:
     both = [Work(68_000, 3, 1, 2, 200, False, SILICONE, reproducible) for reproducible in (True, False)]
     alone = replace(both[0], ranks=1)
