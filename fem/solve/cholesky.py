@@ -101,6 +101,7 @@ def rows_of(nodes: NDArray[np.intp], d: int) -> NDArray[np.intp]:
 # Stable factors leave below 1e-15, in whatever units and however ill-conditioned; blocks may leave 1e-14 and more, as
 # in the hard cases with layers or nu near 0.5. Ten rounding units separate them.
 BACKWARD_ERROR = 10 * float(np.finfo(float).eps)
+WIDTH = 16  # columns that MUMPS solves at once: 12 of 2e4 unknowns in 3D take a sixth of the time of one by one [1]
 VANISHING_PIVOT = (71, 81)  # PETSC_ERR_MAT_LU_ZRPVT, PETSC_ERR_MAT_CH_ZRPVT
 
 
@@ -216,6 +217,20 @@ class AskedSolver:
                 f"{self.ksp.getPC().getType()}: no convergence for {B.getSize()[1]} columns; change the PETSc options "
                 f"-{self.ksp.getOptionsPrefix()}*, such as a larger ksp_max_it or ksp_rtol"
             )
+
+
+def block_solves(factor: PETSc.Mat, S: PETSc.Mat, X: NDArray[Any]) -> NDArray[Any]:
+    """S^-1 X of local rows (n_local, k) by a factor of S that takes several columns at once (MUMPS). Collective."""
+    result = np.empty(X.shape, order="F")
+    for first in range(0, X.shape[1], WIDTH):
+        part = np.asfortranarray(X[:, first : first + WIDTH])
+        B = PETSc.Mat().createDense((S.getSizes()[0], (None, part.shape[1])), array=part, comm=S.comm)
+        solved = B.duplicate()
+        factor.matSolve(B, solved)
+        result[:, first : first + WIDTH] = solved.getDenseArray(readonly=True)
+        B.destroy()
+        solved.destroy()
+    return result
 
 
 def direct_solves(ksp: PETSc.KSP) -> PETSc.Mat | AskedSolver:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from softgrasp.fem.solve.cholesky import (
     AskedSolver,
     NodeOrder,
     OrderedFactor,
+    block_solves,
     direct_solves,
     dissect,
     factor_blocks,
@@ -144,15 +146,18 @@ class TissueSolver:
         r, w = self.S.createVecs()
         result = np.zeros(X.shape, order="F")
         some = np.flatnonzero(total(self.S.comm.tompi4py(), np.abs(X).sum(axis=0)) != 0)
-        divided = isinstance(self.factor, OrderedFactor)
+        block = None
         if isinstance(self.factor, OrderedFactor):  # each rank stores the whole factor
-            result[:, some] = self.factor.columns(X[:, some])
+            block = self.factor.columns
+        elif self.name == "mumps" and len(some) > 1 and not user_options(self.ksp.getOptionsPrefix()):
+            block = partial(block_solves, self.ksp.getPC().getFactorMatrix(), self.S)
+        if block is not None and len(some):
+            result[:, some] = block(X[:, some])
         try:
             for j in some:
                 r.array_w[:] = X[:, j]
-                if divided:
-                    w.array_w[:] = result[:, j]
-                else:
+                w.array_w[:] = result[:, j]
+                if block is None:
                     self.solve(r, w)
                     result[:, j] = w.array_r
                 if where:

@@ -45,7 +45,7 @@ def test_mumps_is_mumps_on_any_ranks(comm: MPI.Intracomm, reproducible: bool) ->
 @pytest.mark.ranks
 @pytest.mark.parametrize("name", ["cholesky", "mumps"])
 def test_columns_are_divided_between_ranks(comm: MPI.Intracomm, name: SolverName) -> None:
-    """The bits of one solve after the other, with a share of the solves on each rank."""
+    """The bits of one solve after the other where each rank has a share of the solves."""
     system = build(make_scene(CUBE), comm=comm).system
     solver = make_solver(system.K_ee.copy(), name, system.layout, "test_", reproducible=True)
     X = np.random.default_rng(2).standard_normal((system.layout.n_e, 7))
@@ -56,7 +56,9 @@ def test_columns_are_divided_between_ranks(comm: MPI.Intracomm, name: SolverName
     for j in range(X.shape[1]):
         r.array_w[:] = X[:, j]
         solver.solve(r, w)
-        assert np.array_equal(found[:, j], w.array_r)
+        if isinstance(solver.factor, OrderedFactor):
+            assert np.array_equal(found[:, j], w.array_r)
+        assert close(found[:, j], w.array_r) < 1e-13  # MUMPS takes several at once; condition about 1e2
     if isinstance(solver.factor, OrderedFactor):
         counts = []
         factor, solver.factor.factor = solver.factor.factor, Counting(solver.factor.factor, counts)
@@ -82,3 +84,15 @@ class Counting:
 def test_a_run_says_who_factored(comm: MPI.Intracomm, name: SolverName, package: str) -> None:
     run = simulate(build(make_scene(CUBE, time={"solver": name, "steps": 2}), comm=comm))
     assert run.solver == (name, "requested by the scene", package)
+
+
+@pytest.mark.ranks
+def test_a_spread_factor_solves_several_columns_at_once(comm: MPI.Intracomm) -> None:
+    system = build(make_scene(CUBE), comm=comm).system
+    dense = gather_matrix(system.layout, system.K_ee).toarray()
+    solver = make_solver(system.K_ee.copy(), "mumps", system.layout, "test_", reproducible=False)
+    full = np.random.default_rng(3).standard_normal((system.layout.n_e, 17))  # one more than go at once
+    full[:, 5] = 0.0
+    found = solver.columns(local_rows(system.layout, full), "a test")
+    assert close(gather_rows(system.layout, found), np.linalg.solve(dense, full)) < 1e-12  # condition about 1e2
+    solver.destroy()
