@@ -39,7 +39,7 @@ class Need:
         return share * (self.mesh + self.factor) + ranks * self.tables
 
 
-def factor_bytes(name: str, n: int, dimension: int, copies: int) -> float:
+def factor_bytes(name: str, n: int, dimension: int, copies: float) -> float:
     """Estimated memory of the Cholesky factor over all ranks [byte]; nested dissection.
 
     nnz(L) / n = 7.75 log2 n - 44 in 2D and 19.5 n^(1/3) - 85 in 3D, fitted to regular simplex meshes of 1e3 to 4e6
@@ -67,7 +67,7 @@ def need(scene: Scene, dimension: int, cells: int, ranks: int, free: float, run:
     n_s = d + (d * (d - 1) // 2 if scene.effects.rotation else 0)
     work = steps_of(scene, n_e, d, ranks)
     name = work.solver(scene.time.solver, free)
-    copies = ranks if work.repeated(name) else 1
+    copies = work.copies(name)
     outputs = sum(n_s if o.kind == "hand" else d for o in scene.control.outputs) if scene.control is not None else d
     # times; q, v, a, c, pulls and temporaries of the hand's table; outputs, their sum and their rigid share: measured
     # 194 byte a step for n_s = d = 2

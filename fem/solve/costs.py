@@ -43,6 +43,7 @@ REPEATED_RANKS = 4
 # Unknowns from which ranks factor a subtree each in 2D: a solve with 1e5 takes 6.9 ms on two ranks, 11.3 on one, and
 # 12.7 where both have the whole factor; below, the messages and the sum of a step take as long.
 SUBTREES_FROM = 10_000
+SUBTREES_MEMORY = 4.5  # memory of their set-up over that of one factor [1]: 4.4 and 4.8 with 1e5 and 4e5 unknowns
 
 
 @dataclass(frozen=True)
@@ -117,8 +118,13 @@ class Work:
 
     def memory(self, name: SolverName) -> float:
         """Modelled memory of set-up and factor over all ranks [byte]."""
-        copies = self.ranks if self.repeated(name) else 1
-        return copies * self.n * self._at(self._cost(name).memory)
+        return self.copies(name) * self.n * self._at(self._cost(name).memory)
+
+    def copies(self, name: SolverName) -> float:
+        """Memory of set-up and factor over all ranks, over that of one factor [1]."""
+        if self.split(name):
+            return SUBTREES_MEMORY
+        return self.ranks if self.repeated(name) else 1
 
     def setup(self, name: SolverName) -> float:
         """Modelled time of the set-up [s]."""

@@ -216,7 +216,7 @@ def _explained(scene: Scene, looked: Model, sizes: ModelSizes, model: Model | No
     free = comm.allreduce(free_bytes(scene), MPI.MIN)
     work = steps_of(scene, sizes.n_e, d, ranks)
     name, reason = chosen(scene, work, free)
-    copies = ranks if work.repeated(name) else 1
+    copies = work.copies(name)
     small = looked.system
     if small.layout.n_e <= DIRECT_LIMIT[d]:  # the modes need a factor
         omega, Phi = lowest_modes(small, min(MODES, small.layout.n_e))
