@@ -1,4 +1,4 @@
-"""``python -m benchmarks accuracy | certified | figures | forward | meshes | outputs | riccati | scale | seeds``."""
+"""``python -m benchmarks``: accuracy, certified, figures, forward, meshes, mujoco, outputs, riccati, scale, seeds."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from benchmarks import (
     accuracy,
     certified,
     figures,
+    flex,
     forward,
     forward_rows,
     meshes,
@@ -30,6 +31,7 @@ from softgrasp.study.shell.ending import run_command
 COMMANDS = {
     "forward": forward, "riccati": riccati, "meshes": meshes, "accuracy": accuracy, "certified": certified,
     "outputs": outputs, "seeds": seeds, "figures": figures, "solvers": solvers, "scale": scale,
+    "mujoco": flex,
 }  # fmt: skip
 WORKERS: dict[str, Callable[..., Iterable[Any]]] = {
     "forward": forward_rows.measure_row, "riccati": riccati.measure_row, "scale": scale_rows.measure_row,
