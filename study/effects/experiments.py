@@ -155,13 +155,17 @@ class SwitchRuns:
 
 
 def check_elements(
-    model: Model, trajectory: Trajectory, tolerance: float, mesh: TissueMesh | None = None
+    model: Model, trajectory: Trajectory | None, tolerance: float, mesh: TissueMesh | None = None
 ) -> Elements | None:
-    """Run the scene with P2 when it has P1 and a ratio of Poisson at which P1 locks, else None. Collective."""
+    """Run the scene with P2 when it has P1 and a ratio of Poisson at which P1 locks, else None. Collective.
+
+    ``trajectory``: run of the model; None where it is made here.
+    """
     nu = max(young_poisson(m.lam, m.mu)[1] for m in of_layers(model.system.materials))
     if model.scene.tissue.order != 1 or nu <= LOCKING + 1e-9:
         return None
     other = build(quadratic(model), comm=model.system.layout.comm, mesh=mesh)
+    trajectory = simulate(model, RunOptions()) if trajectory is None else trajectory
     change = compare(displacements(model, trajectory), displacements(other, simulate(other, RunOptions())))
     needed = change.outputs > tolerance
     text = (

@@ -28,7 +28,7 @@ from softgrasp.study.shell import RepeatableRun, interleave, medians, rotated
 BURSTS = 7  # short ones make a sample by their median, so that a busy moment of the machine falls out
 BURST_SECONDS = 0.02  # of the steps of one; long against the timer
 SAMPLE_SECONDS = 0.15  # of the bursts of a sample: one with long steps needs fewer, for the moment falls out in them
-BUILD_SECONDS = 6.0  # the builds are repeated at most about this long
+BUILD_SECONDS = 3.0  # the builds are repeated at most about this long
 MOST_STEPS = 20_000  # in one sample
 STEPS = 10  # in which nothing may be created
 OWN = "Viewer"  # made by the count itself

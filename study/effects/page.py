@@ -106,8 +106,11 @@ def parts(study: EffectsStudy) -> list[Section]:
         ("samples", f"{study.repeats} of the steps, {study.builds} of the builds, interleaved; medians of pairs"),
         *PROOFS.items(),
     )  # fmt: skip
+    note = NOTE
+    if study.coarser:
+        note += f" Changes are those of the scene on coarser cells, n_e = {study.coarser}; all else is the scene's own."
     return [
-        table_of(study.findings, VERDICTS, "Relative change, gate and verdict").section(NOTE, terminal=True),
+        table_of(study.findings, VERDICTS, "Relative change, gate and verdict").section(note, terminal=True),
         Section("Advice", rows=advice, terminal=True),
         Table(tuple(COSTS), [*table_of(study.tried, COSTS).rows, scene], "Costs").section(
             f"The step time of the scene differs from itself by {percent(low, '+')} to {percent(high, '+')}.",

@@ -151,6 +151,7 @@ class EffectsStudy:
     base: dict[str, float]  # the scene as it is: medians of mesh, assembly, setup, step [s], memory [byte], flops
     sizes: dict[str, int]  # n_s, n_e, states, steps and cells of the scene
     elements: Elements | None  # what P2 changes; None unless P1 may lock
+    coarser: int  # unknowns of the coarser copy of a large mesh that gives all changes of the outputs [1]; 0: none
 
     @property
     def tried(self) -> list[EffectResult]:
@@ -169,7 +170,7 @@ class EffectsStudy:
 
     def to_dict(self) -> dict[str, Any]:
         """What result.json holds."""
-        own = ("tolerance", "repeats", "builds", "noise", "base", "advised", "warnings", "sizes")
+        own = ("tolerance", "repeats", "builds", "noise", "base", "advised", "warnings", "sizes", "coarser")
         return {name: getattr(self, name) for name in own} | {
             "effects": {f.name: f.to_dict() for f in self.findings},
             "off_is_free": all(f.proof.holds for f in self.off if f.proof),

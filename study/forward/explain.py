@@ -281,22 +281,32 @@ def _plan(model: Model) -> PlanSizes | None:
 
 def coarser_copy(model: Model) -> Model:
     """The scene of a large box on fewer cells, for numbers of two digits; else the model itself. Collective."""
-    scene, layout = model.scene, model.system.layout
-    tissue, most = scene.tissue, MOST_LOOKED_AT[layout.dimension]
-    adaptive = tissue.refine is not None and tissue.refine.tolerance is not None
-    if tissue.cells is None or adaptive or layout.n_e <= most:
+    if fewer_cells(model, MOST_LOOKED_AT) is None:
         return model
-    return on_fewer_cells(scene, layout.comm) or model
+    return on_fewer_cells(model.scene, model.system.layout.comm) or model
+
+
+def fewer_cells(model: Model, most: dict[int, int]) -> Scene | None:
+    """The scene of a box that has more unknowns than ``most`` by dimension, on that many; None of any other scene."""
+    tissue, layout = model.scene.tissue, model.system.layout
+    adaptive = tissue.refine is not None and tissue.refine.tolerance is not None
+    if tissue.cells is None or adaptive or layout.n_e <= most[layout.dimension]:
+        return None
+    return _coarsened(model.scene, most)
+
+
+def _coarsened(scene: Scene, most: dict[int, int]) -> Scene:
+    """The scene of a box on the cells of about so many unknowns, by dimension."""
+    cells = scene.tissue.cells or []
+    ratio = (most[len(cells)] / (len(cells) * _lattice(scene))) ** (1 / len(cells))
+    fewer = [max(int(ratio * n), 1) for n in cells]
+    return scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"cells": fewer})})
 
 
 def on_fewer_cells(scene: Scene, comm: MPI.Intracomm) -> Model | None:
     """The scene of a box on fewer cells; None where these miss the zone or a layer. Collective."""
-    cells = scene.tissue.cells or []
-    ratio = (MOST_LOOKED_AT[len(cells)] / (len(cells) * _lattice(scene))) ** (1 / len(cells))
-    fewer = [max(int(ratio * n), 1) for n in cells]
-    other = scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"cells": fewer})})
     try:
-        return build(other, comm=comm, run=False)
+        return build(_coarsened(scene, MOST_LOOKED_AT), comm=comm, run=False)
     except (MeshError, SceneError):
         return None
 

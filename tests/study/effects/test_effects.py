@@ -24,7 +24,7 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.model.scales import rigid_inertia
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.scene.file import load_scene_collective
+from softgrasp.fem.scene.file import load_scene, load_scene_collective
 from softgrasp.study.effects import measure as effects_measure
 from softgrasp.study.effects.experiments import Displacements, Names, SwitchRuns, compare, displacements
 from softgrasp.study.effects.measure import (
@@ -332,6 +332,22 @@ def test_advice_on_a_shipped_scene_can_be_followed(comm: MPI.Intracomm) -> None:
     assert joined
     for name, company in joined.items():
         assert company.together == pytest.approx(named(runs, name, company), rel=1e-9)  # parallel sums, other order
+
+
+def test_changes_of_a_large_box_are_those_of_the_same_scene_on_coarser_cells(
+    comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("softgrasp.study.effects.run.MOST_TRIED", {2: 40, 3: 40})
+    changes = ["time.steps=10", "study.repeats=1", "effects.damping={kind='kelvin-voigt',beta=0.01}"]
+    study = study_effects(load_scene("paper_forward", ["tissue.cells=[4,8]", *changes]), comm)
+    coarse = build(load_scene("paper_forward", ["tissue.cells=[2,5]", *changes]), comm=comm)
+    assert study.coarser == study.to_dict()["coarser"] == coarse.system.layout.n_e <= 40 < study.sizes["n_e"]
+    by = {f.name: f for f in study.findings}
+    alone = SwitchRuns(coarse.scene, SCALES, {frozenset({"damping"}): coarse}).alone("damping")
+    assert by["damping"].change == alone[0]
+    assert by["damping"].cost.memory > 100  # of the scene's own matrices
+    note = next(part.text for part in parts(study) if "deform." in part.text)
+    assert f"on coarser cells, n_e = {study.coarser}" in note
 
 
 @pytest.mark.ranks(2)
