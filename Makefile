@@ -70,6 +70,7 @@ pictures: demo ## make the README's pictures again
 	$(BIN)/python tools/draw_rooms.py docs/rooms.png
 	cd docs && ../$(BIN)/python ../demos/demo_arm.py
 	$(BIN)/python tools/draw_finite_strain.py docs/finite_strain.png
+	$(BIN)/python -m tools.draw_hertz docs/hertz.png
 
 docs: $(STAMP) ## build the documentation into out/site, with all links checked
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

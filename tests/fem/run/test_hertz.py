@@ -1,89 +1,20 @@
-"""A disc pressed into a block against Hertz: a^2 = 4 P R / (pi E*), p = p_0 sqrt(1 - (x / a)^2) in plane strain."""
+"""A disc pressed into a block against Hertz."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import meshio
-import numpy as np
 import pytest
 
-from softgrasp.fem.model.build import build
-from softgrasp.fem.model.surface import make_surface
-from softgrasp.fem.petsc import Array, to_scipy
-from softgrasp.fem.run.simulate import simulate
+from tests.helpers.hertz import HALF_WIDTH, press
 
 pytestmark = pytest.mark.serial
-R, SIDE, YOUNG, NU = 200.0, 10.0, 1000.0, 0.3  # radius of the disc, half the width and the height of the block
-HALF_WIDTH = 0.2  # about, of the contact
-SCENE = """name = "hertz"
-[tissue]
-mesh = "hertz.msh"
-order = {order}
-material = {{ young = {young}, poisson = {nu}, rho = 1.0 }}
-[contact]
-box = [[-11.0, 9.999999], [11.0, 11.0]]
-[motion]
-profile = "hold"
-[effects]
-obstacles = true
-[[obstacle]]
-kind = "disc"
-center = [0.0, {center!r}]
-radius = {radius}
-[time]
-steps = 1
-end = 1e-6
-start = "equilibrium"
-"""
-
-
-def lines(h: float, inner: float, end: float) -> Array:
-    """Places from 0 to an end, with distance h up to ``inner`` and growing ones after it."""
-    x, step = list(np.arange(0, inner + h / 2, h)), h
-    while x[-1] < end:
-        step *= 1.25
-        x.append(min(end, x[-1] + step))
-    if x[-1] - x[-2] < 0.4 * (x[-2] - x[-3]):
-        del x[-2]
-    return np.array(x)
-
-
-def write_mesh(h: float, path: Path) -> None:
-    right, up = lines(h, 1.6 * HALF_WIDTH, SIDE), lines(h, 2 * h, SIDE)
-    x, cells = np.concatenate([-right[:0:-1], right]), []
-    n = len(x)
-    for j in range(len(up) - 1):
-        for i in range(n - 1):
-            a, b, c, d = (j * n + i + k for k in (0, 1, n, n + 1))
-            cells += [[a, b, d], [a, d, c]] if x[i] + x[i + 1] < 0 else [[a, b, c], [b, d, c]]
-    points = np.array([[a, b, 0.0] for b in up for a in x])
-    meshio.write(path, meshio.Mesh(points, [("triangle", np.array(cells))]), file_format="gmsh")
-
-
-def hertz(order: int, h: float, folder: Path) -> tuple[float, float, float]:
-    """Errors of half-width and of the pressure in the middle, and the half-width that the force gives [m]."""
-    write_mesh(h, folder / "hertz.msh")
-    depth = 0.00045
-    text = SCENE.format(order=order, young=YOUNG, nu=NU, center=depth - R, radius=R)
-    (folder / "hertz.toml").write_text(text)
-    model = build(str(folder / "hertz.toml"))
-    result, system, surface = simulate(model), model.system, make_surface(model.space, model.system)
-    z = result.snapshots.Z[: system.layout.n_e, 0]
-    f = (to_scipy(system.K_ee) @ z)[surface.rows[1::2]]  # what the obstacle must press with, upwards
-    x, on = surface.X[:, 0], np.abs(f) > 1e-9 * np.abs(f).max()
-    assert f[on].min() > 0, (x[on], f[on])
-    assert np.abs(x[on]).max() < 1.3 * HALF_WIDTH
-    P, stiffness = f.sum(), YOUNG / (1 - NU**2)
-    a, peak = np.sqrt(4 * P * R / (np.pi * stiffness)), np.sqrt(P * stiffness / (np.pi * R))
-    width = 2 * np.sqrt(f @ x**2 / P)  # the second moment of Hertz' pressure is P a^2 / 4
-    middle = f[on][np.abs(x[on]).argmin()] / (h if order == 1 else h / 3)  # over the integral of the vertex function
-    return width / a - 1, middle / peak - 1, a
 
 
 @pytest.mark.parametrize(("order", "widths", "peaks"), [(1, 3e-2, 0.1), (2, 1e-3, 1e-3)])
 def test_half_width_and_pressure_are_those_of_hertz(order: int, widths: float, peaks: float, tmp_path: Path) -> None:
-    width, peak, a = hertz(order, HALF_WIDTH / 8, tmp_path)
-    assert a == pytest.approx(HALF_WIDTH, rel=0.05)
+    pressed = press(order, HALF_WIDTH / 8, tmp_path)
+    width, peak = pressed.errors
+    assert pressed.a == pytest.approx(HALF_WIDTH, rel=0.05)
     assert abs(width) < widths, (width, peak)
     assert abs(peak) < peaks, (width, peak)
