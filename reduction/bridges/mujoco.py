@@ -24,11 +24,12 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.errors import ResourceError
+from softgrasp.fem.errors import ResourceError, shortened
 from softgrasp.fem.frame.rotation import cross_matrix
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.bridges.compiled import CompiledStep
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.system import ModelError
 from softgrasp.reduction.turning.model import TurningModel
 
@@ -71,7 +72,9 @@ class MujocoTissue:
         materials: tuple[LayerMaterial, ...] | None = None,
     ) -> None:
         if not isinstance(rom, TurningModel):
-            raise ModelError("the model is one of small angles; reduce a scene with effects.frame = 'hand'")
+            if isinstance(rom, ReducedModel):
+                raise ModelError("the model is one of small angles; reduce a scene with effects.frame = 'hand'")
+            raise ModelError(f"{shortened(repr(rom))} is no model; give what sg.reduce or sg.load returns")
         if len(rom.M_hand) != 6:
             raise ModelError("the model is plane; MuJoCo needs one of three dimensions")
         self.mujoco, self.mj_model = _mujoco(), mj_model

@@ -191,6 +191,8 @@ def test_what_does_not_fit_is_refused(rom: TurningModel) -> None:
         MujocoTissue(rom, world('<body name="hand"><freejoint/><geom size=".01" mass=".001"/></body>', 1e-3))
     with pytest.raises(ModelError, match="small angles"):
         MujocoTissue(reduced({"damping": False}, 12, turns=False), model)
+    with pytest.raises(ModelError, match=r"'block.h5' is no model; give what sg.reduce or sg.load returns"):
+        MujocoTissue("block.h5", model)  # type: ignore[arg-type]
 
 
 def test_loads_of_a_spin_are_those_of_point_masses() -> None:
