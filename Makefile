@@ -40,8 +40,12 @@ test: $(STAMP) ## lint, all tests on one rank, those marked `ranks(2)` on 2, tho
 	$(BIN)/mpiexec -n 2 $(BIN)/python -m pytest -q --own-ranks
 	$(BIN)/mpiexec -n 3 $(BIN)/python -m pytest -q --own-ranks
 
+# Three runs: of one with all tests a worker was lost near its end now and then, after six minutes and without a word.
+test-one: ONE = $(BIN)/python -m pytest -q -n 2 --dist loadfile --max-worker-restart=0
 test-one: $(STAMP)
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --max-worker-restart=0
+	$(ONE) tests/fem
+	$(ONE) tests/reduction tests/lqr tests/benchmarks tests/hardcases
+	$(ONE) tests/study tests/test_*.py
 
 test-all: test ## the same, and everything else that runs on 2 ranks (nightly)
 	$(BIN)/mpiexec -n 2 $(BIN)/python -m pytest -q
