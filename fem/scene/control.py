@@ -183,6 +183,11 @@ class Constraints(Section):
     )
     speed: Positive | None = Field(None, description="largest speed of the hand in each direction [m/s]")
     jump: Positive | None = Field(None, description="largest change of the force from interval to interval [N]")
+    body: Literal["boundary"] | Annotated[list[Label | list[float]], Field(min_length=1)] = Field(
+        "boundary",
+        description="what keeps every gap [no unit]: the whole boundary, or some of its nodes with all between them, "
+        "each given by the name of an output of kind node or by a point near to it [m]",
+    )
     clearance: NonNegative = Field(0.0, description="distance to every obstacle beyond all margins [m]")
     margin: Literal["bound"] | NonNegative = Field(
         "bound",

@@ -94,7 +94,7 @@ class _Way:
 
 def _way(plan: Plan, chord: float) -> _Way:
     plant, task, horizon = plan.horizon.plant, plan.task, plan.horizon
-    n_s, H, extent = plant.n_s, horizon.steps, _extent(plan)
+    n_s, H, extent = plant.n_s, horizon.steps, plan.task.size
     x, u = horizon.state(task.start, plan.c), horizon.input(task.start, plan.c)
     near = np.r_[0:n_s, 2 * n_s : 2 * n_s + len(plant.tissue.omega)]
     T, W = swings(plant)
@@ -106,16 +106,13 @@ def _way(plan: Plan, chord: float) -> _Way:
     behind, pushed = follow(plant, x[-1, -1], -1.0, TAIL)
     planned = np.concatenate([swung(x, u), swung(behind, pushed).max(axis=0)[None]])
     seen = np.abs(plant.tissue.seen).max(axis=(0, 1))
+    seen[seen == 0] = 1.0  # nodes that the hand holds see no mode: any width is as good
     still = STILL * extent / np.sqrt(len(seen)) / seen
     moves = np.abs(x[..., near[n_s:]]).max(axis=(0, 1))
     box = np.concatenate([np.full(n_s, BOX * extent), np.maximum(SHARE * moves, still)])
     boxes = np.vstack([np.tile(box, (H, 1)), box + np.abs(behind[..., near]).max(axis=(0, 1))])
     most = planned + np.maximum(FASTER * planned.max(axis=(0, 1)), still / (chord * _pace(plant)))
     return _Way(x, plan.c.reshape(H, n_s), u, near, boxes, planned, most, np.abs(pushed).max(axis=0))
-
-
-def _extent(plan: Plan) -> float:
-    return float(np.ptp(plan.task.places, axis=0).max())
 
 
 def make_program(plan: Plan, T: Array, x_bar: Array, ticks: Ticks, period: float) -> Program:
@@ -159,7 +156,7 @@ def _program(plan: Plan, T: Array, x_bar: Array, ticks: Ticks, every: int, force
     A, B = (np.stack(parts) for parts in zip(*plant.held, strict=True))
     flows, drives = flow.wide(A + B @ plant.K), B @ plant.L  # (parts + 1, N, n), (parts + 1, N, n_s)
     F, D = flow.long(flows[-1], flow.wide(plant.K)), flow.long(drives[-1], plant.L)
-    rows = _Rows(flow, H, flows, drives, (plant.grid / plant.parts) ** 2 / 8, DIGITS * _extent(plan))
+    rows = _Rows(flow, H, flows, drives, (plant.grid / plant.parts) ** 2 / 8, DIGITS * plan.task.size)
     first_way = _way(plan, rows.chord)
     first = _all_rows(rows, plan, first_way, force, F, D)
     a, d, free, exact, obstacle, part, leaves, along = rows.arrays()
@@ -176,7 +173,7 @@ def _program(plan: Plan, T: Array, x_bar: Array, ticks: Ticks, every: int, force
     way = np.vstack([flow.wide(first_way.x[:, 0]), np.zeros((1, flow.n))])
     if flow.jump:  # u of the interval before
         way[1:H, plant.N :] = first_way.u[:-1]
-    tube = np.broadcast_to(task.noise, task.places.shape) + ROUNDING * _extent(plan)
+    tube = np.broadcast_to(task.noise, task.places.shape) + ROUNDING * task.size
     rest = x_bar.copy()
     rest[:n_s] += task.start[:n_s]
     return Program(

@@ -258,7 +258,7 @@ def _rows(horizon: Horizon, task: Task, normals: Array, c: Array) -> tuple[Array
     """Rows of all obstacles with room for the bends of the plan c, and the group of each: its obstacle and interval."""
     rows, right = [np.zeros((0, len(c)))], [np.zeros(0)]
     x, u = horizon.state(task.start, c), horizon.input(task.start, c)
-    rounding = ROUNDING * float(np.ptp(task.places, axis=0).max())  # so that no gap of the plan is below zero by it
+    rounding = ROUNDING * task.size  # so that no gap of the plan is below zero by it
     for i, (shape, n) in enumerate(zip(task.shapes, normals, strict=True)):
         margin = ROOM * both_ends(bends(horizon.plant, x, u, n, path_turns(horizon, task, i, n)))
         moved = np.einsum("kd,kid->ki", n, task.shifts(i, instants(horizon)))[:, :, None]
@@ -312,7 +312,7 @@ def _judged(
         left = _left(shape, task, n, seen_by(horizon, task, i, body)) - own
         gap = min(gap, float(left.min()))
         unsafe |= (left < 0).any(axis=(1, 2))
-        holds = left[:H] <= (ROOM - 1) * own[:H] + TIGHT * float(np.ptp(task.places))
+        holds = left[:H] <= (ROOM - 1) * own[:H] + TIGHT * task.size
         bend = max(bend, float(own[:H][holds].max(initial=0.0)))
     unsafe |= broken(plant, x, u, task.limits, task.u_bar)
     last = np.flatnonzero(unsafe[H:])

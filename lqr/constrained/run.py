@@ -83,7 +83,7 @@ def run_plan(
     Args:
         solution: optimal feedback, and the cost that is still to come at the end.
         surface: nodes of the body on its boundary.
-        tissue: all modes of the plant.
+        tissue: all modes of the plant, at the nodes that keep gaps.
         start: state at t = 0.
         target: state at rest.
         notify: called with the number of steps done and in all.
@@ -116,7 +116,7 @@ def run_plan(
     )
     at = (np.arange(len(inputs))[:, None] * each + np.arange(plant.parts + 1) * STEPS).ravel()
     hand, places = runs[0].q_s[at][:, None], plan.task.places - target.state.q_s
-    off = planned.body[at] - (places + hand) - off_hand.reshape(len(at), *places.shape)
+    off = surface.of(planned.body)[at] - (places + hand) - off_hand.reshape(len(at), *places.shape)
     return PlanRuns(planned, free, dt, _largest(exact - reduced), _largest(off))
 
 
@@ -177,5 +177,5 @@ def body_run(
     body = surface.nodes + np.concatenate([moved, held], axis=1)
 
     to_come = predicted_cost(problem, solution, run.final - target.state)
-    apart = on_root(problem.layout.comm, lambda: plan.task.gaps(body, run.times))
+    apart = on_root(problem.layout.comm, lambda: plan.task.gaps(surface.of(body), run.times))
     return BodyRun(run.times, body, run.inputs, run.v_s, apart, float(run.cost[-1]) + to_come)

@@ -9,6 +9,8 @@ the differences.
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 import scipy.spatial
 
@@ -38,13 +40,14 @@ def separate(shape: Shape, body: Array) -> tuple[Array, float]:
     assert isinstance(shape, Ball | Polytope)
     corners = shape.corners if isinstance(shape, Polytope) else shape.center[None, :]
     if body.shape[1] == 2 and len(body) > 2:
-        return _separate_plane(shape, corners, body)
+        with suppress(scipy.spatial.QhullError):  # on a line
+            return _separate_plane(shape, corners, body)
     normal = _apart((body[:, None] - corners).reshape(-1, body.shape[1]))
     return normal, float((body @ normal).min() - supports(shape, normal[None])[0])
 
 
 def _separate_plane(shape: Ball | Polytope, corners: Array, body: Array) -> tuple[Array, float]:
-    """Of three points and more in the plane."""
+    """Of points in the plane that enclose something."""
     hull = body[scipy.spatial.ConvexHull(body).vertices]
     sides = np.roll(hull, -1, axis=0) - hull
     normals = [np.column_stack([-sides[:, 1], sides[:, 0]])]  # inwards: hulls turn to the left

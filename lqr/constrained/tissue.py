@@ -139,6 +139,19 @@ class Surface:
     first: int  # number among all free ones of the first of this rank
     free: int  # number of free ones
     nodes: Array  # places in the undeformed body [m], (nodes, d)
+    kept: NDArray[np.int64] | None = None  # numbers of those that keep gaps, ascending; None: all
+
+    def keeping(self) -> Surface:
+        """The nodes that keep gaps, as a surface of their own."""
+        if self.kept is None:
+            return self
+        here = self.kept[(self.kept >= self.first) & (self.kept < self.first + len(self.rows))] - self.first
+        first, free = (int(np.searchsorted(self.kept, number)) for number in (self.first, self.free))
+        return Surface(self.rows[here], first, free, self.nodes[self.kept])
+
+    def of(self, body: Array) -> Array:
+        """The nodes that keep gaps, of places of all, (.., nodes, d)."""
+        return body if self.kept is None else body[..., self.kept, :]
 
 
 def make_surface(layout: BlockLayout, free: np.ndarray, held: np.ndarray) -> Surface:

@@ -20,7 +20,8 @@ from softgrasp.lqr.constrained.rest import known_tissue, run_rest
 from softgrasp.lqr.constrained.rows import Limits
 from softgrasp.lqr.constrained.run import PlanRuns, run_inputs, run_plan
 from softgrasp.lqr.constrained.task import Task
-from softgrasp.lqr.constrained.tissue import ModalTissue, Surface, make_surface, modal_tissue, require_plannable
+from softgrasp.lqr.constrained.tissue import ModalTissue, Surface, modal_tissue, require_plannable
+from softgrasp.lqr.design.body import body_surface
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.linearise import finite_problem
 from softgrasp.lqr.design.online import Known, PlannedOnline, run_online
@@ -48,7 +49,7 @@ class PlannedControl:
     runs: PlanRuns
     """Plan and optimal feedback on the full plant."""
     surface: Surface
-    """Nodes of the body on its boundary."""
+    """Nodes of the body on its boundary, and which of them keep gaps."""
     names: tuple[str, ...]
     """Of the obstacles."""
     online: PlannedOnline | None = None
@@ -98,7 +99,7 @@ def run_plan_finite(design: Design, model: Model, planned: PlannedControl) -> Fi
         return FinitePlan(np.zeros(0), np.inf, str(error))
     # with the same steps, whose error is that of both
     linear = run_inputs(design.problem, design.solution, plan, surface, design.start, design.target, inputs, dt)
-    return FinitePlan(run.least, float(np.linalg.norm(run.body - linear.body, axis=2).max()))
+    return FinitePlan(run.least, float(np.linalg.norm(surface.of(run.body - linear.body), axis=2).max()))
 
 
 def plan_control(
@@ -128,22 +129,23 @@ def plan_control(
     obstacles = make_obstacles(design.model.scene, plant.layout.dimension)
     given = control_of(design.model).constraints
     assert given is not None
-    surface, whole = _surface(design.model), plant.layout.n_e <= DENSE_LIMIT
+    surface, whole = body_surface(design.model), plant.layout.n_e <= DENSE_LIMIT
+    near = surface.keeping()
     start = _at_rest(design)
     with watch.stage("bound"):
         require_plan(design.model)
         loop = observed.loop if observed is not None else ModalLoop(plant, DENSE_LIMIT if whole else None)
         if whole:
-            tissue, shapes = modal_tissue(plant, surface, loop), loop.plant.Phi
+            tissue, shapes = modal_tissue(plant, near, loop), loop.plant.Phi
         else:
-            tissue, shapes = known_tissue(plant, surface)
+            tissue, shapes = known_tissue(plant, near)
         reduced = tissue.reduced(given.N // 2 - plant.layout.n_s, given.grid)
         limits = _limits(design)
         run_error = None if whole else 0.0
-        error = np.full(surface.nodes.shape, 0.0 if given.margin == "bound" else given.margin)
+        error = np.full(near.nodes.shape, 0.0 if given.margin == "bound" else given.margin)
         if given.margin == "bound":
             most = np.abs(np.linalg.inv(plant.M_s)) @ (_force(limits) + np.abs(design.target.u))
-            rest_of = None if whole else run_rest(plant, surface, tissue, shapes, given.grid)
+            rest_of = None if whole else run_rest(plant, near, tissue, shapes, given.grid)
             if rest_of is not None:
                 run_error = max(float((rest_of.error(i) @ most).max()) for i in range(len(rest_of.instants)))
             pulses = PulseError(tissue, reduced, given.grid, rest_of)
@@ -155,10 +157,11 @@ def plan_control(
         begin[: plant.layout.n_s] = start
         bodies, names = tuple(o.shape for o in obstacles), tuple(o.name for o in obstacles)
         penalty = None if given.penalty == "auto" else float(given.penalty)
-        target = _places(plant, surface, design)
+        target = _places(plant, near, design)
         task = Task(
             begin, target, design.target.u, bodies, names, error, given.clearance + estimated, limits, noise,
             given.margin == "bound", penalty, tuple(o.path for o in obstacles),
+            0.0 if near is surface else plant.layout.extent,
         )  # fmt: skip
         steps = first_horizon(design.model, plant)
         longest = None if given.horizon == "auto" else steps
@@ -238,13 +241,9 @@ def plan_sizes(model: Model) -> PlanSizes | None:
         return None
     plant = problem(model)
     steps, n_s = first_horizon(model, plant), plant.layout.n_s
-    gaps = len(model.scene.obstacle or []) * (given.parts + 1) * len(_surface(model).nodes)
+    gaps = len(model.scene.obstacle or []) * (given.parts + 1) * len(body_surface(model).keeping().nodes)
     hand = 2 * n_s * sum(limit is not None for limit in (given.force, given.speed, given.jump))
     return PlanSizes(given.N, steps, given.grid, n_s * steps, steps * (gaps + hand))
-
-
-def _surface(model: Model) -> Surface:
-    return make_surface(model.system.layout, *model.space.surface())
 
 
 def _at_rest(design: Design) -> Array:

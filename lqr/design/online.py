@@ -51,7 +51,7 @@ class PlannedOnline:
 class Known:
     """The tissue as the bound has it."""
 
-    surface: Surface  # nodes of the boundary
+    surface: Surface  # nodes of the boundary, and which of them keep gaps
     tissue: ModalTissue  # all modes, or the lowest with static answers
     shapes: Array  # of them, local rows
     loop: ModalLoop  # the plant in all modes, or in the lowest

@@ -59,6 +59,7 @@ def figure_bodies(planned: PlannedControl, picture: PictureMesh, out_png: Path) 
         colours = style.colour_map()(np.linspace(0.15, 1.0, len(instants)))
         for colour, n in zip(colours, instants, strict=True):
             ax.add_collection(LineCollection(lines[n][edges], colors=[colour], lw=1.3, zorder=3))
+            _dots(ax, planned, lines[n], colour)
             x, y = centre[n]
             ax.text(
                 x,
@@ -97,6 +98,7 @@ def figure_views(planned: PlannedControl, picture: PictureMesh, out_png: Path) -
                 seen = run.body[n][:, plane]
                 around = seen[ConvexHull(seen).vertices]
                 ax.plot(*np.vstack([around, around[:1]]).T, color=colour, lw=1.3, zorder=3)
+                _dots(ax, planned, seen, colour)
                 x, y = centre[n][list(plane)]
                 ax.text(
                     x, y, f"{run.times[n]:.3g} s", ha="center", va="center", fontsize=7, zorder=4, path_effects=HALO
@@ -105,6 +107,12 @@ def figure_views(planned: PlannedControl, picture: PictureMesh, out_png: Path) -
             ax.set(xlim=box[:, plane[0]], ylim=box[:, plane[1]], aspect="equal", ylabel=f"${AXES[plane[1]]}$ [m]")
         views[-1].set_xlabel("$x$ [m]")
         return style.save(figure, out_png)
+
+
+def _dots(ax: Any, planned: PlannedControl, body: Array, colour: Any) -> None:
+    """The nodes that keep gaps, where they are not the whole boundary."""
+    if planned.surface.kept is not None:
+        ax.plot(*planned.surface.of(body).T, "o", ms=3, color=colour, zorder=4)
 
 
 def _shown(body: Array) -> tuple[Array, list[int]]:
@@ -193,7 +201,9 @@ def figure_gaps(planned: PlannedControl, out_png: Path) -> tuple[Path, ...]:
         for i, name in enumerate(planned.names):
             gaps.plot(run.times[thin], run.gaps[thin, i], color=style.CYCLE[i % 4], label=name)
             if planned.online is not None and planned.online.covariance is not None:
-                room = 3 * _deviation(planned.online.covariance, task, i, run.body[thin], run.times[thin])
+                room = 3 * _deviation(
+                    planned.online.covariance, task, i, planned.surface.of(run.body)[thin], run.times[thin]
+                )
                 low, high = run.gaps[thin, i] - room, run.gaps[thin, i] + room
                 gaps.fill_between(run.times[thin], low, high, color=style.CYCLE[i % 4], alpha=0.25, lw=0)
         if run.gaps.min(initial=1.0) > 0:
@@ -202,7 +212,7 @@ def figure_gaps(planned: PlannedControl, out_png: Path) -> tuple[Path, ...]:
             gaps.set_yscale("symlog", linthresh=1e-3)
         gaps.axhline(margin, **LIMIT, label="clearance and margins")
         gaps.set_ylabel("gap [m]")
-        gaps.legend(ncols=4, loc="upper right")
+        gaps.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5)
         for j, axis in enumerate(AXES[: run.inputs.shape[1]]):
             force.plot(
                 run.times[:-1][thin], run.inputs[thin, j], color=style.CYCLE[j], label=axis, drawstyle="steps-post"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem import AXES
+from softgrasp.fem.petsc import Array
 from softgrasp.lqr import Plan
 from softgrasp.lqr.design.constrained import FinitePlan
 from softgrasp.study.control.obstacle.result import PlannedStudy
@@ -17,14 +18,16 @@ from softgrasp.study.report import Section, Table, captioned, in_words, percent
 CAPTIONS = {
     "obstacle.png": "The boundary of the body on the full plant under the plan, and the way of its middle; grey and "
     "dashed: under the optimal feedback, which has no obstacles, where it is deepest inside. A body in space is seen "
-    "from the front and from above, where outlines may cross and nothing touches. What moves is drawn at the same "
-    "instants.",
+    "from the front and from above, where outlines may cross and nothing touches. Dots: the nodes that keep gaps, "
+    "where they are not the whole boundary. What moves is drawn at the same instants.",
     "gaps.png": "Gap of the body to every obstacle on the full plant, with a band of three standard deviations where "
     "an observer keeps it on its way under noise. Dashed: clearance and margins, which the reduced plant keeps; the "
-    "full plant may use the margins up. Below: force and speed of the hand with their limits.",
+    "full plant may use the margins up. Where `control.constraints.body` gives nodes, gaps are theirs. Below: force "
+    "and speed of the hand with their limits.",
     "times.png": "Times of the quadratic program in Python, without a guess and from the active rows of a plan nearby, "
     "against a tick of the loop and the interval after which the next plan is due.",
 }
+FEW = 4  # nodes that a sentence lists
 GAPS = ("obstacle", "least gap [m]", "at [s]", "without the plan [m]")
 
 
@@ -41,7 +44,8 @@ def plan_sections(study: PlannedStudy, drawn: Sequence[Path]) -> list[Section]:
     parts = [Section("Plan", sentence(study), rows=facts(study), figures=captioned(drawn, CAPTIONS), terminal=True)]
     if gaps:
         text = (
-            f"Distance of body and obstacle on the full plant at every step of {1e3 * runs.dt:g} ms; negative: overlap."
+            f"Distance of {'body' if study.named is None else 'these nodes'} and obstacle on the full plant at every "
+            f"step of {1e3 * runs.dt:g} ms; negative: overlap."
         )
         parts.append(Section("Gaps", text, header=GAPS, rows=gaps, terminal=True))
     return parts
@@ -65,17 +69,23 @@ def sentence(study: PlannedStudy) -> str:
     paid = study.planned.runs.planned.cost
     more = f"{percent(study.excess)} more than that of the optimal feedback without obstacles and limits"
     cost = f"The cost of the plan is {paid:.4g}, {more}."
-    if plan.certified:
-        return f"The full linear plant keeps every gap and limit under the plan at every time: this is proved. {cost}"
-    run = "keeps" if study.kept else "does not keep"
-    return f"The plan is not certified: {plan.reason}. The full plant {run} every gap in its run. {cost}"
+    gap = "every gap" if study.named is None else f"every gap of {_nodes(study.named)}"
+    if not plan.certified:
+        run = "keeps" if study.kept else "does not keep"
+        return f"The plan is not certified: {plan.reason}. The full plant {run} {gap} in its run. {cost}"
+    other = "" if study.named is None else ", but for no other node"
+    return f"The full linear plant keeps {gap} and limit under the plan at every time: this is proved{other}. {cost}"
 
 
 def facts(study: PlannedStudy) -> list[tuple[str, str]]:
     """Label and text."""
     plan, runs = study.planned.plan, study.planned.runs
     task, plant = plan.task, plan.horizon.plant
-    rows: list[tuple[str, Any]] = [
+    rows: list[tuple[str, Any]] = []
+    if study.named is not None and task.shapes:
+        least = in_words([f"{gap:.3g} m" for gap in study.boundary])
+        rows.append(("least gap of the whole boundary", f"{least}, which the plan does not look at"))
+    rows += [
         ("reduced plant", f"N = {plant.N}, forces held for {plant.grid:g} s"),
         ("horizon", f"{plan.horizon.steps} intervals, {plan.followed} more followed until the rest is safe"),
         ("quadratic program", f"{len(plan.c)} variables, {study.rows} rows, {_held(plan)}"),
@@ -119,6 +129,14 @@ def facts(study: PlannedStudy) -> list[tuple[str, str]]:
             )
         )
     return rows
+
+
+def _nodes(nodes: Array) -> str:
+    """The nodes that keep gaps, in words."""
+    if len(nodes) > FEW:
+        return f"the {len(nodes)} nodes of control.constraints.body, and of what is between them,"
+    places = in_words([f"({', '.join(f'{x:.4g}' for x in node)})" for node in nodes.tolist()])
+    return f"the node at {places}" if len(nodes) == 1 else f"the nodes at {places}, and of what is between them,"
 
 
 def _noisy(study: PlannedStudy) -> list[tuple[str, str]]:

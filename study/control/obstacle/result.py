@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from softgrasp.fem.petsc import Array
 from softgrasp.lqr import PlannedControl
 from softgrasp.lqr.design.constrained import FinitePlan
 from softgrasp.lqr.program.replan import Outcome
+
+ZERO = 1e-12  # of the largest coordinate: rounding of the mesh
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,22 @@ class PlannedStudy:
         return self.planned.plan.free_cost / self.optimal_cost - 1
 
     @property
+    def named(self) -> Array | None:
+        """Nodes that keep gaps where they are not the whole boundary [m], (nodes, d); else None."""
+        surface = self.planned.surface
+        if surface.kept is None:
+            return None
+        nodes = surface.nodes[surface.kept]
+        return np.asarray(np.where(np.abs(nodes) > ZERO * np.abs(surface.nodes).max(), nodes, 0.0))
+
+    @property
+    def boundary(self) -> list[float]:
+        """Least gap of the whole boundary to each obstacle [m]."""
+        run = self.planned.runs.planned
+        least = self.planned.plan.task.gaps(run.body, run.times).min(axis=0)
+        return [float(gap) for gap in least]
+
+    @property
     def kept(self) -> bool:
         """Whether the full plant keeps every gap at every step."""
         return bool((self.planned.runs.planned.gaps >= 0).all())
@@ -61,6 +80,7 @@ class PlannedStudy:
         used = np.abs(runs.planned.inputs).max(axis=0)
         return {
             "names": list(self.planned.names),
+            **({} if self.named is None else {"body": self.named.tolist(), "gap_min_boundary": self.boundary}),
             "gap_min": runs.planned.least.tolist(),
             "time": runs.planned.times_least.tolist(),
             "gap_min_without_plan": runs.free.least.tolist(),

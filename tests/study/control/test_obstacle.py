@@ -59,6 +59,18 @@ def test_page_files_and_numbers_agree(tmp_path: Path) -> None:
     assert "has no obstacles" in page
 
 
+def test_page_of_named_nodes_speaks_of_them_alone(tmp_path: Path) -> None:
+    result, text = control(tmp_path, "control.constraints.body=['tip']", "tissue.cells=[2,4]")
+    found, words = result["obstacle"], " ".join(text.split())
+    assert found["body"] == [[0.5, 0.0]]
+    assert min(found["gap_min"]) >= 0 > -0.1 > max(found["gap_min_boundary"])
+    assert (
+        "keeps every gap of the node at (0.5, 0) and limit under the plan at every time: this is proved, but for no"
+        in words
+    )
+    assert "which the plan does not look at" in words
+
+
 def test_explain_names_the_program_that_control_solves() -> None:
     overrides = [*SMALL, "control.constraints.horizon=34", "control.constraints.margin=1e-3"]
     model = build(load_scene("paper_obstacle", overrides))
