@@ -1,4 +1,4 @@
-"""The books of a run's energy: what loads, contact and damping did in each step, and whether it explains the energy."""
+"""The balance of a run's energy: work of loads and contact, dissipation, and the energy that they leave unexplained."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Ledger:
 
     Args:
         midpoint: step of the tissue, after the drive of the hand was made.
-        loads: coefficients c of the load G c of each step, (steps, n_s); written by others.
+        loads: coefficients c of the load G c of each step, (steps, n_s); the run fills them in.
         contact: contact with obstacles, or None.
 
     Attributes:
@@ -37,7 +37,7 @@ class Ledger:
         self.first = self.peak = 0.0
 
     def record(self, n: int) -> None:
-        """Enter the step that ends at n."""
+        """Keep pull and dissipation of the step that ends at time n. Not collective."""
         self.pulls[n] = self.midpoint.pull()
         if self.taken is not None:
             self.taken[n, 0] = self.midpoint.dissipated
@@ -45,7 +45,7 @@ class Ledger:
                 self.taken[n, 1] = self.contact.table.energy[0]
 
     def start(self, state: TissueState) -> None:
-        """Take the energy of the first state. Collective."""
+        """Keep the energy of the first state. Collective."""
         self.first = self.midpoint.energy(state)
         self.peak = abs(self.first)
 

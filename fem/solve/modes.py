@@ -14,7 +14,7 @@ from softgrasp.fem.system import BlockSystem
 
 PREFIX = "softgrasp_modes_"
 TOLERANCE = 1e-11  # of 1/omega^2 in the iteration; rounding in M-products is about 1e-15 n^(1/2)
-RESIDUAL = 1e-8  # bound on the relative error of omega^2 that is let pass
+RESIDUAL = 1e-8  # largest bound on the relative error of omega^2 that is accepted
 KEPT_ENTRIES = 50_000_000  # of modes that stay with the system: 400 MB over all ranks
 ROUGH = 1e-3  # tolerance of the search for missed copies [1]: enough where others lie ten times as far away
 
@@ -48,7 +48,7 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
 
 
 def _lowest(system: BlockSystem, solver: TissueSolver, k: int) -> tuple[Array, Array]:
-    """The modes, computed. Collective."""
+    """Compute omega [1/s], (k,), and Phi, local rows (n_local, k). Collective."""
     n_e = system.layout.n_e
     eps = _make_eps(system, solver)
     vectors: list[PETSc.Vec] = []
@@ -94,6 +94,7 @@ class _Factored:
 
 
 def _make_eps(system: BlockSystem, solver: TissueSolver) -> SLEPc.EPS:
+    """Krylov-Schur on K_ee^-1 M_ee, with the factor of ``solver``. Collective."""
     eps = SLEPc.EPS().create(system.layout.comm)
     eps.setOptionsPrefix(PREFIX)
     eps.setOperators(system.K_ee, system.M_ee)
@@ -121,7 +122,7 @@ def _solve(
     squares: list[float],
     tolerance: float = TOLERANCE,
 ) -> None:
-    """Append the k lowest modes M-orthogonal to those found. Collective."""
+    """Append the k lowest modes M-orthogonal to ``vectors``: phi there, omega^2 [1/s2] to ``squares``. Collective."""
     eps.setDimensions(nev=k, ncv=min(max(2 * k, k + 15), system.layout.n_e))
     eps.setTolerances(tolerance, 500)
     if vectors:

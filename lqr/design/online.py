@@ -36,24 +36,24 @@ class PlannedOnline:
     """
 
     controller: Controller
-    """What a robot runs."""
+    """The controller that a robot runs."""
     covariance: Array | None
-    """Of the place of every node around its way [m2], (nodes, d, d); None without an observer."""
+    """Covariance of the place of every node around the planned one [m2], (nodes, d, d); None without an observer."""
     times: Array
-    """Instants of the run that are kept [s], (count,)."""
+    """Times of the run [s], (count,)."""
     gaps: Array
-    """Distance of body and obstacle in it, negative where they overlap [m], (count, obstacles)."""
+    """Distance of body and obstacle at these times, negative where they overlap [m], (count, obstacles)."""
     log: tuple[Replanned, ...]
     """How every interval began."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """The tissue as the bound has it."""
+    """The tissue in the modes from which the bound of the plan's error is computed."""
 
     surface: Surface  # nodes of the boundary, and which of them keep gaps
     tissue: ModalTissue  # all modes, or the lowest with static answers
-    shapes: Array  # of them, local rows
+    shapes: Array  # these modes and answers, local rows (n_local, k)
     loop: ModalLoop  # the plant in all modes, or in the lowest
 
 
@@ -70,7 +70,7 @@ def planned_controller(
 
     Args:
         design: the optimal feedback, which keeps the plant near to the plan.
-        shapes: of the tissue that the plan's plant was reduced from, local rows.
+        shapes: modes and answers of the tissue that the plan's plant was reduced from, local rows (n_local, k).
         observed: observer of the scene; None: the tissue is carried from the measured hand.
         rate: ticks a second without an observer; None: those of the scene.
 
@@ -107,7 +107,7 @@ def planned_controller(
 def run_online(
     design: Design, plan: Plan, known: Known, observed: ObservedControl | None
 ) -> tuple[PlannedOnline | None, str]:
-    """The planned controller on the full plant for the horizon, or why there is none. Collective."""
+    """The planned controller on the full plant for the horizon, or None and why there is none. Collective."""
     from softgrasp.lqr.observer.judge import make_ticks
     from softgrasp.lqr.observer.sensors import Noise, make_disturbance, make_sensors
     from softgrasp.lqr.observer.tube import node_covariance, node_rows, run_tube

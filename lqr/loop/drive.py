@@ -17,7 +17,14 @@ from softgrasp.lqr.plant.target import Target
 
 
 class LoopDrive(ABC):
-    """Solves one step for hand and tissue; ``q``, ``v`` and ``u`` are the histories."""
+    """Solves one step for hand and tissue.
+
+    Attributes:
+        plant: equation of the hand L a = u + f and its numbers dt, s, kappa, alpha, theta, g, Y, see `HandStep`.
+        q: displacement of the hand at each time, (steps + 1, n_s) [m, rad].
+        v: velocity of the hand at each time, (steps + 1, n_s) [m/s, rad/s].
+        u: input of each step, (steps, n_s) [N, N m].
+    """
 
     def __init__(self, plant: HandStep, steps: int) -> None:
         self.plant, n_s = plant, plant.system.layout.n_s
@@ -28,7 +35,7 @@ class LoopDrive(ABC):
         """Leave w and load of step n in the midpoint; fill row n of u, row n + 1 of q and v. Collective."""
 
     def move(self, n: int, u: Array, a: Array) -> None:
-        """Midpoint rule of the hand."""
+        """Midpoint rule of the hand under the acceleration a (n_s,): row n of u, n + 1 of q and v."""
         dt = self.plant.dt
         self.u[n], self.v[n + 1] = u, self.v[n] + dt * a
         self.q[n + 1] = self.q[n] + dt * (self.v[n] + self.v[n + 1]) / 2
@@ -44,7 +51,15 @@ class LoopDrive(ABC):
 
 
 class GainDrive(LoopDrive):
-    """The input is u_bar + K (x - x_bar) = offset + K x, with or without limits. Making one is collective."""
+    """The input is u_bar + K (x - x_bar) = offset + K x, with or without limits. Making one is collective.
+
+    Attributes:
+        gain: K of hand and tissue, local rows.
+        bound: largest |u| by degree of freedom, (n_s,) [N, N m]; None without limits.
+        K_q: columns of K for the hand's displacement, (n_s, n_s).
+        K_v: columns of K for the hand's velocity, (n_s, n_s).
+        offset: u_bar - K x_bar, (n_s,).
+    """
 
     def __init__(self, plant: HandStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
         super().__init__(plant, steps)

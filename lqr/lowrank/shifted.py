@@ -43,7 +43,11 @@ class FactorsAhead:
 
     SciPy frees the memory of a factor in the thread that made it and in no other, so each factor goes back there.
 
-    ``make``: factor of a shift; the second argument is the number of the thread, for what it may overwrite.
+    Attributes:
+        make: factor of S(p) at a shift p; the second argument is the number of the thread, for what it may overwrite.
+        threads: executors of one thread each.
+        coming: factors under way, by shift: number of the thread, and the future.
+        maker: number of the thread that made the factor taken last.
     """
 
     def __init__(self, make: Callable[[complex, int], scipy.sparse.linalg.SuperLU], threads: int) -> None:
@@ -159,6 +163,7 @@ class GatheredTissue(ShiftedTissue):
         )
         thin = layout.dimension < 3 and layout.n_e <= THIN_UP_TO
         self.blocking = {"panel_size": 1, "relax": 16} if thin else {}
+        # factors by shift: rank that has it, and there the factor
         self.cache: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]] = {}
         self.ahead: FactorsAhead | None = None
         threads = THREADS[layout.dimension]
@@ -185,6 +190,7 @@ class GatheredTissue(ShiftedTissue):
         return parts, order
 
     def _make(self, p: complex, shell: int = 0) -> scipy.sparse.linalg.SuperLU:
+        """Factor of the permuted S(p); its values overwrite matrix number ``shell`` of ``self.shells``."""
         p = p if p.imag else p.real
         if self.same:
             S = self.shells[shell]
@@ -219,6 +225,7 @@ class GatheredTissue(ShiftedTissue):
         self.factors += len(shifts)
 
     def _forget(self) -> None:
+        """Empty the cache; a factor is freed in the thread that made it."""
         old, self.cache = self.cache, {}
         if self.ahead is not None and old:
             (_, factor) = old.popitem()[1]

@@ -1,7 +1,7 @@
 """What is measured of hand and tissue, and what disturbs them.
 
 y = C x + noise:  q_s [, v_s], markers q_s + z at nodes of the tissue, and the force T'(K_ee z + D_ee v_z) that the
-tissue puts on the hand; D_ee without what drags.
+tissue puts on the hand; D_ee without damping proportional to the mass.
 E x' = A x + B u + F w:  F = [0; M_s; 0; 0] unknown acceleration of the hand, [0; 0; 0; p] load on the tissue.
 """
 
@@ -38,7 +38,7 @@ class Sensors:
     names: tuple[str, ...]  # of the samples, p
     speed: bool  # whether the velocity of the hand is a sample
     markers: slice  # samples of the markers
-    nodes: tuple[tuple[float, ...], ...]  # of the markers [m]
+    nodes: tuple[tuple[float, ...], ...]  # coordinates of the node of each marker [m], d each
 
     def of(self, Phi: Array) -> tuple[Array, Array]:
         """Samples of z = Phi and of v_z = Phi, local sums, (p, k) each."""
@@ -98,7 +98,7 @@ def make_sensors(problem: RiccatiProblem, markers: list[list[float]], noise: Noi
 
 
 def _marker(problem: RiccatiProblem, point: Array, i: int) -> tuple[Array, Array, tuple[float, ...]]:
-    """Rows of q_s (d, n_s) and transposed of z, local (n_local, d), and the node. Collective."""
+    """Marker i: rows of C for q_s (d, n_s), for z transposed, local (n_local, d), and its node [m]. Collective."""
     layout, d = problem.layout, problem.layout.dimension
     if point.shape != (d,):
         raise ControlError(f"control.observer.markers[{i}] = {point.tolist()} must have {d} entries")

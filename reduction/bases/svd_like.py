@@ -69,7 +69,18 @@ def _pairs(X: Array, limit: int | None, share: float | None) -> tuple[Array, Arr
 
 
 class _PairSelection:
-    """Symplectic pairs found so far and the remainder of X; ``norms`` measures columns in the units of X."""
+    """Symplectic pairs found so far, and the rest of X that they leave.
+
+    Attributes:
+        norms: Euclidean norm of each column in the units of X.
+        S: first vectors of the pairs, (2 r, pairs).
+        T: second vectors of the pairs, (2 r, pairs).
+        weights: contribution of each pair to |X|_F, (pairs,).
+        rest: columns that span X - S S^+ X, U diag(s) by its singular value decomposition.
+        size: largest singular value of the rest.
+        largest: largest singular value of X.
+        square: |X|_F^2 in the units of X.
+    """
 
     def __init__(self, X: Array, norms: Callable[[Array], Array]) -> None:
         self.norms = norms
@@ -83,7 +94,7 @@ class _PairSelection:
         self.largest = self.size
 
     def _compress(self, rest: Array) -> None:
-        """Keep the few columns that span the rest as well: X'JX only turns."""
+        """Set rest, U, s and size to the few columns that span the same space; X'JX is rotated only."""
         U, s, _ = scipy.linalg.svd(rest, full_matrices=False)
         keep = s > max(EPS * s[0], 0.01 * SMALLEST * self.largest) if len(s) else s > 0
         self.U, self.s = U[:, keep], s[keep]

@@ -16,12 +16,16 @@ FUNCTIONS = """
 void softgrasp_tissue_begin(const Tissue *t, const double *gravity, double *room);
 int softgrasp_tissue_end(const Tissue *t, double *room);
 """
+# work arrays of the C struct by name; a size is a product of letters: k coordinates, n velocities of MuJoCo, 6, 9
 ROOM = {"known": "k", "pulled": "k6", "turned": "k6", "pairs": "k99", "six": "n6", "product": "n6", "b": "6",
         "before": "n", "user": "n", "inertia": "66", "force": "6", "wrench": "6", "a": "k", "e": "k"}  # fmt: skip
 
 
 class CompiledStep:
-    """What a step does before and after MuJoCo solves, in place in its data."""
+    """What a step of a `MujocoTissue` does before and after MuJoCo solves, in place in its data.
+
+    ``compiled``: ffi and functions of the library; ``tissue``: the `MujocoTissue`, whose arrays are read here.
+    """
 
     def __init__(self, compiled: Any, tissue: Any) -> None:
         self._ffi, self._code = compiled
@@ -57,7 +61,7 @@ class CompiledStep:
         return self._ffi.from_buffer(f"{kind}[]", values)
 
     def begin(self, data: Any, a: Array, e: Array) -> None:
-        """Inertia into MuJoCo's mass matrix, forces into the applied ones."""
+        """Add inertia to MuJoCo's mass matrix and loads to its applied forces, from coordinates a and rates e, (k,)."""
         if data is not self._data:  # its arrays stay where they are
             self._data, self._views = data, (data.xmat[self._body], data.qvel, data.M, data.qfrc_applied)
             for name, view in zip(("Q", "qvel", "M", "applied"), self._views, strict=True):
@@ -70,5 +74,5 @@ class CompiledStep:
         return bool(self._code.softgrasp_tissue_end(self._struct, self._room_at))
 
     def state(self) -> tuple[Array, Array, Array]:
-        """Coordinates, rates and wrench."""
+        """Coordinates a and rates e, (k,), and the wrench on the body in its axes, (6,) [N, N m]."""
         return self._arrays["a"].copy(), self._arrays["e"].copy(), self._arrays["wrench"].copy()

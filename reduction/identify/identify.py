@@ -69,7 +69,7 @@ def identify(
     """Values (mu, lambda, ..) = argmin sum |y_N(t) - y|^2 / sigma^2 [BCL99], and their errors by cause. Collective.
 
     The answer says by ``reasons`` why it must not be used: a misfit beyond chance, a mesh or a time step that changes a
-    value by more than the noise, a direction that the data do not see, rounds that do not settle.
+    value by more than the noise, a direction that the data do not determine, rounds that do not settle.
 
     >>> import numpy as np, softgrasp as sg
     >>> from softgrasp.reduction.identify.data import Measurements
@@ -92,10 +92,10 @@ def identify(
             exceeds the noise.
         offset: fit a constant error of each output too.
         shift: fit a time shift between hand and outputs too.
-        robust: a loss in which outliers count little.
+        robust: a loss that gives outliers little weight.
         refine: refine the mesh, and the time step, where they exceed the noise.
-        law: "linear" elasticity, or a hyperelastic law by hyper-reduced models; "auto" is that of the scene, and takes
-            "neo-hooke" where finite strain changes a linear value by more than the noise and the data do not object.
+        law: "linear" elasticity, or a hyperelastic law by hyper-reduced models; "auto" is that of the scene, and uses
+            "neo-hooke" where finite strain changes a linear value by more than the noise and fits no worse.
         certified: a certified model of the scene, or its file: its basis serves for all values, its bound is the part
             of the reduction. Linear elasticity alone.
         posterior: samples of the posterior by emcee, which check the covariance; 0: none.
@@ -139,16 +139,16 @@ def identify(
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked of a model."""
+    """What is fitted to which data, and how."""
 
     data: tuple[Measurements, ...]  # an experiment each
-    names: Sequence[str]  # of what is fitted
+    names: Sequence[str]  # parameters that are fitted, as "mu" or "skin.mu"
     sigma: Array  # standard deviation of the noise of each output, (p,) [m, rad]
     N: int  # dimension of the reduced models
     offset: bool  # whether a constant error of each output is fitted too
-    shift: bool  # whether a time shift is
-    robust: bool  # whether outliers count little
-    law: Law  # of the material
+    shift: bool  # whether a time shift of each experiment is fitted too
+    robust: bool  # whether the loss gives outliers little weight
+    law: Law  # "auto", "linear" or the name of a hyperelastic law
     certified: CertifiedModel | str | Path | None  # model of the scene that is used instead of others
     tick: Callable[[int], None]  # called after each round
     posterior: int = 0  # samples of the posterior
@@ -195,9 +195,9 @@ def _identify(model: Model, asked: Asked) -> Identified:
 class Solved:
     """A fit with its errors."""
 
-    fit: Fit  # where the rounds end
-    line: Linearisation  # around there
-    errors: OutputErrors  # of the outputs there
+    fit: Fit  # values and history of the last round
+    line: Linearisation  # outputs linear in log theta around the fit
+    errors: OutputErrors  # errors of the outputs at the fit, by cause
     law: str  # "linear", or the hyperelastic law
 
 
@@ -335,9 +335,9 @@ def _cures(
     result = {"reduction": certified if N is None else f"take more than N = {N} columns"}
     if mesh is not None and estimate is not None:
         tolerance = finer_tolerance(mesh, noise, estimate)
-        result["mesh"] = f"set tissue.order = 2 and tissue.refine.tolerance = {tolerance:g}, or take --refine"
+        result["mesh"] = f"set tissue.order = 2 and tissue.refine.tolerance = {tolerance:g}, or use --refine"
     if step is not None:
-        result["time step"] = f"set time.steps = {finer_steps(step, noise, scene.time.steps)}, or take --refine"
+        result["time step"] = f"set time.steps = {finer_steps(step, noise, scene.time.steps)}, or use --refine"
     return result
 
 

@@ -40,7 +40,7 @@ class MotionPlan:
     deviations: Array  # of the parameters with the first j of them, relative, (markers, k)
     own: Array  # of the parameters with the outputs of the scene, relative, (k,)
     alone: Array  # size of the errors with each candidate alone: geometric mean of their ellipsoid, (candidates,)
-    hidden: tuple[str, ...]  # combinations of the parameters that all its markers do not see, in words
+    hidden: tuple[str, ...]  # combinations of the parameters that its markers do not determine, in words
 
     @property
     def size(self) -> float:

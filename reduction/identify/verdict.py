@@ -11,7 +11,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.shown import percent
 from softgrasp.reduction.identify.unknowns import Unknown
 
-SIGHT = 1.0  # change of the data per log theta, in sigma, below which a direction is not seen: error above a factor e
+SIGHT = 1.0  # change of the data per log theta, in sigma, below which they leave an error above a factor e
 NAMED = 0.3  # of the largest entry of a direction: smaller ones are not named
 LAGS = 10  # of the test for white residuals
 BY_CHANCE = 1e-4  # probability below which residuals are not called white
@@ -34,7 +34,11 @@ class Residuals:
 def judge(residual: Array, tables: Sequence[Array], parameters: int, robust: bool) -> Residuals:
     """Misfit against chance, and the test of Ljung and Box on each output [LB78].
 
-    ``tables``: the residuals of each experiment over time, (times, outputs), nan where nothing was measured.
+    Args:
+        residual: all residuals over their sigma, (m,).
+        tables: the same of each experiment over time, (times, outputs), nan where nothing was measured.
+        parameters: number of values that were fitted.
+        robust: whether the loss was the robust one, so that outliers are clipped.
     """
     from scipy.special import chdtrc
 
@@ -67,7 +71,12 @@ def direction_in_words(unknowns: Sequence[Unknown], direction: Array, least: flo
 
 
 def unseen(unknowns: Sequence[Unknown], sizes: Array, directions: Array) -> list[str]:
-    """Directions that the data do not see, in words."""
+    """Directions that the data do not determine, in words.
+
+    Args:
+        sizes: change of the data along each direction of log theta, in sigma, (n,).
+        directions: unit vectors of log theta as rows, (n, n).
+    """
     return [direction_in_words(unknowns, d) for s, d in zip(sizes, directions, strict=True) if s < SIGHT]
 
 
@@ -84,10 +93,12 @@ def reasons(
     """Why an answer is refused, a sentence each.
 
     Args:
+        residuals: what :func:`judge` found.
         unsettled: largest change of log theta in the last of too many rounds, 0 where they converged.
-        noise: part of the noise in each value, relative.
-        parts: that of mesh, time step and reduction, None where it is not known.
-        cures: what mends each.
+        invisible: directions that the data do not determine, of :func:`unseen`.
+        noise: part of the noise in each value, relative, (n,).
+        parts: "mesh", "time step", "reduction" with that part in each value, (n,), None where it is not known.
+        cures: what to set against each of these parts, an imperative by the same name.
         edges: names of the values that end where the range of the only small model does.
     """
     found = []
@@ -105,7 +116,7 @@ def reasons(
         f"{name} ends at the end of the box of the certified model: train a wider one, or leave it out."
         for name in edges
     ]
-    found += [f"The data do not see {words}: fit fewer parameters, or measure more." for words in invisible]
+    found += [f"The data do not determine {words}: fit fewer parameters, or measure more." for words in invisible]
     for name, part in parts.items():
         if part is None:
             found.append(f"The part of the {name} is not known for this scene, so that the answer has no error bar.")
@@ -135,6 +146,6 @@ def warnings(residuals: Residuals, robust: bool) -> tuple[str, ...]:
     if residuals.outliers > max(1, 1e-3 * residuals.count) and not robust:
         found.append(
             f"{residuals.outliers} of {residuals.count} residuals exceed {OUTLIER:g} sigma: where these are outliers, "
-            "take the robust loss."
+            "use the robust loss."
         )
     return tuple(found)

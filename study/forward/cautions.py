@@ -54,7 +54,7 @@ def coarse(omega: float, dt: float, end: float, period: str) -> list[str]:
     if not share > COARSE_STEP:
         return []
     steps = int(np.ceil(end * omega / (2 * np.pi * COARSE_STEP)))
-    return [f"dt is {share:.2g} of {period}, so even that is coarse in time: use at least {steps} steps."]
+    return [f"dt is {share:.2g} of {period}, coarse in time even for that: use at least {steps} steps."]
 
 
 def turned(angle: float) -> list[str]:

@@ -138,7 +138,7 @@ class Simulation:
         if len(lag):
             i = int(lag.argmax())
             texts.append(
-                f"The output {run.columns[i].label} leaves the rigid motion of the hand by up to {lag[i]:.3g} "
+                f"The output {run.columns[i].label} deviates from the rigid motion of the hand by up to {lag[i]:.3g} "
                 f"{run.columns[i].unit} and by {abs(run.outputs[-1, i] - run.outputs_rigid[-1, i]):.3g} "
                 f"{run.columns[i].unit} at the end."
             )
@@ -200,7 +200,7 @@ def contact_columns(contact: ContactRecord) -> tuple[list[str], Any]:
 
 
 def contact_rows(contact: ContactRecord) -> list[tuple[str, str]]:
-    """What obstacles did, in words: one row each, and the energy that they took."""
+    """What obstacles did, in words: one row each, and the energy that they dissipated."""
     rows = []
     without = "it" if contact.touching.any() else "the effect"
     for o, name in enumerate(contact.names):
@@ -217,7 +217,7 @@ def contact_rows(contact: ContactRecord) -> list[tuple[str, str]]:
         rows.append(("all obstacles", f"force ({force}) N at the end"))
     taken = f"{contact.touch:.3g} J at first touch, {contact.stopped:.3g} J by impulses"
     taken += f", {contact.rubbed:.3g} J by friction" if contact.rubbed else ""
-    return [*rows, ("taken by contact", f"{taken}; deepest penetration {contact.penetration:.1e} m")]
+    return [*rows, ("dissipated by contact", f"{taken}; deepest penetration {contact.penetration:.1e} m")]
 
 
 def newton_keys(newton: NewtonFigures) -> dict[str, float]:

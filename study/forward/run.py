@@ -102,7 +102,7 @@ def _run(session: Session, model: Model, *, resume: bool, until: int | None, cer
     result = simulate_result(model, run, run_warnings(model, run, frames.most[1:]))
     tables = {"trajectory.csv": result.trajectory()}
     session.keep(scene, result.to_json(), tables)
-    mesh_error, unknown = None, "The error of the mesh is not known: its estimate has no contact."
+    mesh_error, unknown = None, "The error of the mesh is not known: its estimate does not include contact."
     if run.contact is None:
         mesh_error, unknown = estimate_error(model, None if certify else SHARE * run_seconds(model))
     accuracy = accuracy_report(mesh_error, run)

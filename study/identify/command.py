@@ -70,7 +70,7 @@ def identify(
     The error has parts by noise, mesh, time step and reduction. fitted.toml is the scene with the values.
 
     Refused, with exit status 3: a misfit beyond chance, a mesh or time step that changes a value by more than the noise
-    (--refine mends both), a direction that the data do not see, a fit that does not converge.
+    (--refine mends both), a direction that the data do not determine, a fit that does not converge.
 
     Where linear elasticity is beyond its range, the fit is made at finite strain, with reduced models of full runs.
 

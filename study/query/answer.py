@@ -22,7 +22,7 @@ class CertifiedAnswer:
     certificate: Certificate  # of the reduced run
     # the reduced run, the full one instead of it, or None when the error is above the tolerance
     run: ReducedTrajectory | Trajectory | None
-    C_s: Array  # outputs of the hand, (p, n_s)
+    C_s: Array  # outputs of the hand per displacement q_s, (p, n_s)
 
     @property
     def full(self) -> bool:
@@ -83,8 +83,8 @@ class QueryResult:
     path: Path  # file of the certified model
     model: CertifiedModel  # model that answered
     each: Sequence[CertifiedAnswer]  # answers in the order of the parameters
-    seconds: float  # of the reduced model
-    many: bool  # by a table of parameters
+    seconds: float  # time of the reduced model for all answers, with their errors [s]
+    many: bool  # whether the parameters are rows of a table
 
     @property
     def counts(self) -> tuple[int, int, int]:
@@ -134,7 +134,7 @@ def _row(answer: CertifiedAnswer, count: int) -> list[Any]:
 
 
 def answer_rows(answer: CertifiedAnswer) -> list[tuple[str, str]]:
-    """The run of one parameter as label and text."""
+    """Outputs of the run of one answer and their errors, as pairs of label and text."""
     run, c = answer.shown, answer.certificate
     rows = [
         ("parameters", answer.parameters),

@@ -152,7 +152,8 @@ def _noisy(study: PlannedStudy) -> list[tuple[str, str]]:
         rows.append(("margin for noise", text))
     counts, seconds = study.outcomes, 1e3 * np.array(study.seconds_online)
     words = (
-        f"{counts['new']} of {len(seconds)} intervals began with a new plan from the estimate, {counts['kept']} went on"
+        f"{counts['new']} of {len(seconds)} intervals began with a new plan from the estimate, "
+        f"{counts['kept']} with the last plan"
     )
     if counts["soft"]:
         words += f", {counts['soft']} gave up gaps by {max(entry.depth for entry in online.log):.2g} m at most"
@@ -163,19 +164,19 @@ def _noisy(study: PlannedStudy) -> list[tuple[str, str]]:
         ("least gap of that run", f"{online.gaps.min():.3g} m, {'with' if noisy else 'without'} noise"),
         (
             "program online",
-            f"{program.count(0)} rows of {study.rows} can be met, {np.median(seconds):.2g} ms in the median and "
-            f"{seconds.max():.2g} ms at most in Python, with the judgement",
+            f"{program.count(0)} rows of {study.rows} can become active, {np.median(seconds):.2g} ms in the median and "
+            f"{seconds.max():.2g} ms at most in Python, with the check of the plan",
         ),
     ]
 
 
 def _finite(finite: FinitePlan) -> str:
-    """Least gap at finite strain, and by how much the linear plant errs there."""
+    """Least gap at finite strain, and the error of the linear plant there."""
     if finite.reason:
         return f"the run fails: {finite.reason}"
     least = float(finite.gaps.min(initial=np.inf))
     kept = "every gap is kept" if least >= 0 else f"a gap is exceeded by {-least:.2g} m"
-    return f"{kept}; the linear plant errs by up to {finite.error:.2g} m, an estimate of the clearance to give"
+    return f"{kept}; the linear plant has an error of up to {finite.error:.2g} m, an estimate of the clearance to give"
 
 
 def _modes(study: PlannedStudy) -> str:
@@ -184,10 +185,12 @@ def _modes(study: PlannedStudy) -> str:
 
 
 def _behind(study: PlannedStudy) -> str:
-    """Of a margin from runs: the part that their own steps have in it."""
+    """Of a margin from runs: the part of their time steps in it."""
     part = study.planned.run_error
     return (
-        "" if part is None else f"; runs of the full plant are behind it, whose own steps err by {part:.1g} m at most"
+        ""
+        if part is None
+        else f"; it comes from runs of the full plant, whose time steps have an error of {part:.1g} m at most"
     )
 
 

@@ -46,7 +46,7 @@ class ContactPoint:
 
 @dataclass(frozen=True)
 class HeldOutMotion:
-    """One motion that made no model."""
+    """One motion that trained no model."""
 
     title: str  # what it does
     target: tuple[float, ...]  # of the hand [m, rad]

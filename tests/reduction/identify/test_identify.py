@@ -91,7 +91,7 @@ def test_a_direction_that_the_data_do_not_see_is_named() -> None:
     run = sg.simulate(layers)
     noisy = run.outputs + np.random.default_rng(0).normal(0, 1e-4, run.outputs.shape)
     found = identify(layers, Measurements("skin", run.times, noisy), "fat.mu,skin.mu", 1e-4)
-    assert found.reasons == ("The data do not see skin.mu alone: fit fewer parameters, or measure more.",)
+    assert found.reasons == ("The data do not determine skin.mu alone: fit fewer parameters, or measure more.",)
     assert found.noise[1] > 1
 
 

@@ -96,7 +96,7 @@ def test_plan_of_the_linear_plant_runs_at_finite_strain(tmp_path: Path) -> None:
     found = soft["obstacle"]["finite_strain"]
     assert found["violation"] == max(0.0, -min(found["gap_min"]))
     assert min(found["gap_min"]) > min(soft["obstacle"]["gap_min"]) - found["error"]
-    assert "the linear plant errs by up to" in text
+    assert "the linear plant has an error of up to" in text
 
 
 @pytest.mark.slow
