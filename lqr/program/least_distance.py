@@ -97,7 +97,10 @@ def _enter(G: Array, active: list[int], multipliers: Array, row: int, violation:
             outside = outside - Q @ along
             again = Q.T @ outside  # a second projection: the first leaves rounding of the size of the row
             outside, along = outside - Q @ again, along + again
-            inside = scipy.linalg.solve_triangular(R, along)
+            try:
+                inside = scipy.linalg.solve_triangular(R, along)
+            except np.linalg.LinAlgError:  # x grows without end, until the rows that hold it are dependent by rounding
+                raise InfeasibleError("no point keeps all rows, to rounding") from None
         square = float(outside @ outside)
         full = violation / square if square > DEPENDENT**2 else np.inf
         falls = np.flatnonzero(inside > 0)

@@ -8,14 +8,17 @@ from functools import cache
 import numpy as np
 
 from softgrasp.fem.model.build import Stopwatch
+from softgrasp.lqr.constrained.tissue import modal_tissue
 from softgrasp.lqr.design.constrained import PlannedControl, plan_control
 from softgrasp.lqr.design.feedback import design
 from softgrasp.lqr.design.observer import ObservedControl, observe
-from softgrasp.lqr.observer.judge import loop_map
+from softgrasp.lqr.observer.judge import loop_map, make_ticks
 from softgrasp.lqr.observer.reduced import reduced_filter
-from softgrasp.lqr.observer.sensors import make_disturbance
+from softgrasp.lqr.observer.sensors import Noise, make_disturbance, make_sensors
+from softgrasp.lqr.observer.tube import node_rows, run_tube
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.program.least_distance import nearest
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
 from tests.hardcases.cases import Family, HardCase, Outcome, here, make, textbook
 
 BODY = ("tissue.cells=[2, 4]", "control.constraints.N=14", "control.constraints.parts=4")
@@ -76,6 +79,30 @@ def projected(*_: str) -> float:
     return float(max((G @ x - h).max(), np.abs(x - nearest(G, h).x).max()))
 
 
+def slit(room: float) -> str:
+    """Two discs beside the body at the target, so far off."""
+    left, right = (f"{{kind='disc', center=[{x:.7f}, 4.0], radius=0.5}}" for x in (-0.5 - room, 1.5 + room))
+    return f"obstacle=[{left}, {right}]"
+
+
+UPWARDS = ("motion.target=[0.0, 3.0]", "control.constraints.margin=1e-3", "control.constraints.horizon=20")
+
+
+def noisy(*_: str) -> float:
+    """How deep the body goes in where place and speed of the hand are measured with noise, without an observer."""
+    model = make("paper_obstacle", *BODY, "control.loop.rate=100")
+    made = design(model)
+    problem, found = made.problem, plan_control(made, Stopwatch(model.system.layout.comm))
+    assert found.online is not None
+    own, loop = found.online.controller, ModalLoop(problem, DENSE_LIMIT)
+    sensors = make_sensors(problem, [], Noise(1e-4, speed=1e-3))
+    ticks = make_ticks(problem, loop, sensors, make_disturbance(problem, 0.0, 0.0, None), own.period)
+    rows = node_rows(modal_tissue(problem, found.surface, loop), problem.layout.n_s)
+    run = run_tube(own, ticks, rows, round(len(found.plan.inputs) / own.period), 1)
+    task = found.plan.task
+    return max(0.0, -float(task.gaps(task.places + run.moved, run.times).min()))
+
+
 PLANS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("wall 5 cm behind the target", (f"obstacle=[{WALL}]",), 0.0),
     ("two equal walls", (f"obstacle=[{WALL}, {WALL}]",), 0.0),
@@ -109,6 +136,8 @@ PLANS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("body that sags by its weight", (
         f"obstacle=[{WALL}]", "effects.gravity=[0, -0.1]", "time.start='equilibrium'",
     ), 0.0),
+    ("slit of two discs, a micrometre narrower than body and margins", (slit(0.999e-3), *UPWARDS), None),
+    ("slit of two discs, a micrometre wider", (slit(1.001e-3), *UPWARDS), 0.0),
 )  # fmt: skip
 
 
@@ -127,6 +156,8 @@ def plan_rows(quick: bool) -> Iterator[HardCase]:
     yield HardCase("one step of the active set", len(PLANS) + 1.0, here(one_step), limited, None, "it needs two")
     rows = "rounding of the conditions of optimality"
     yield HardCase("a hundred thousand rows", len(PLANS) + 2.0, here(optimality), textbook(projected), 1e-12, rows)
+    name, kept = "noise of the hand without an observer", "0.1 mm and 1 mm/s of noise, and every gap is kept"
+    yield HardCase(name, len(PLANS) + 3.0, here(noisy), textbook(depth_free), 0.0, kept)
 
 
 MARKERS = "markers=[[0, 0], [1, 0], [0, 1], [1, 1]]"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softgrasp.lqr.program.least_distance import InfeasibleError, nearest, nearest_soft
+from softgrasp.lqr.program.least_distance import InfeasibleError, _enter, nearest, nearest_soft
 from tests.helpers.least_distance import least_squares
 
 
@@ -13,6 +13,13 @@ def rows(rng: np.random.Generator, m: int, n: int) -> tuple[np.ndarray, np.ndarr
     """Random half-spaces that hold a point of size 2, most of them without the origin."""
     G = rng.standard_normal((m, n)) @ np.diag(rng.uniform(0.1, 3, n))
     return G, G @ (2 * rng.standard_normal(n) / np.sqrt(n)) + rng.uniform(0, 0.3, m)
+
+
+def test_rows_that_became_dependent_by_rounding_keep_no_point() -> None:
+    """An active set as it is left where x grows without end; the triangular solve has a zero pivot there."""
+    G = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    with pytest.raises(InfeasibleError, match="no point keeps all rows, to rounding"):
+        _enter(G, [0, 1], np.ones(2), 2, 1.0)
 
 
 @pytest.mark.parametrize(("m", "n"), [(5, 1), (8, 3), (30, 10), (985, 60)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import locale
 import re
 import shutil
 import subprocess
@@ -83,6 +84,26 @@ def test_c_gives_our_own_loads(kind: str, tmp_path: Path) -> None:
     if kind == "limited":
         loads = [line.split()[-2:] for line in (tmp_path / "golden.log").read_text().splitlines() if "tick" in line]
         assert max(abs(float.fromhex(x)) for x, _ in loads) == 0.5
+
+
+@pytest.mark.skipif(shutil.which("localedef") is None, reason="there is no program here that makes a locale")
+def test_a_decimal_comma_changes_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "locales").mkdir()
+    words = ["localedef", "-i", "de_DE", "-f", "UTF-8", "--no-archive", str(tmp_path / "locales" / "de_DE.UTF-8")]
+    if subprocess.run(words, capture_output=True).returncode:
+        pytest.skip("the description of the locale de_DE is missing here")
+    write_controller(controller("plain"), tmp_path / "point")
+    monkeypatch.setenv("LOCPATH", str(tmp_path / "locales"))
+    before = locale.setlocale(locale.LC_ALL)
+    try:
+        locale.setlocale(locale.LC_ALL, "de_DE.UTF-8")
+        assert f"{1.5:n}" == "1,5"
+        write_controller(controller("plain"), tmp_path / "comma")
+    finally:
+        locale.setlocale(locale.LC_ALL, before)
+    files = sorted(path.name for path in (tmp_path / "point").iterdir())
+    assert len(files) > 3
+    assert all((tmp_path / "point" / name).read_bytes() == (tmp_path / "comma" / name).read_bytes() for name in files)
 
 
 def outcomes(text: str) -> list[float]:
