@@ -27,6 +27,7 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 
+FAST = 0.98  # of the pace with the state known
 TURN = 1.0  # of the fastest mode in a step of Simpson's rule at most [rad]; its error there is a few 1e-4
 
 
@@ -91,6 +92,11 @@ class Judged:
     def stable(self) -> bool:
         """Whether every eigenvalue of the whole loop lies inside the unit circle."""
         return self.abscissa < 0
+
+    @property
+    def fast(self) -> bool:
+        """Whether the loop is as fast as with the state known, within 2 %."""
+        return self.abscissa <= FAST * self.abscissa_known
 
     @property
     def excess(self) -> float:
@@ -183,6 +189,15 @@ def abscissa_without(plant: Ticks, controller: Controller, lost: Array) -> float
     assert controller.observer is not None
     values = np.linalg.eigvals(loop_map(plant, controller.K, controller.observer, lost).F)
     return float(np.log(np.abs(values).max())) / plant.period
+
+
+def slowest_mode(plant: Ticks, controller: Controller) -> int:
+    """Number of the mode of the tissue with most energy in the slowest motion of the loop. Not collective."""
+    assert controller.observer is not None
+    values, vectors = np.linalg.eig(loop_map(plant, controller.K, controller.observer).F)
+    n_s = plant.B.shape[1]
+    slow = np.abs(vectors[2 * n_s : len(plant.A), int(np.abs(values).argmax())]) ** 2
+    return int(slow.reshape(2, -1).sum(axis=0).argmax())
 
 
 def _abscissa(mu: np.ndarray, period: float) -> float:

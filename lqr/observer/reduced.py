@@ -37,6 +37,7 @@ class ReducedFilter:
     left_out: Array  # part of V that the shapes leave out, its diagonal, (p,)
     P: Array  # covariance of the estimate before a sample, by the reduced plant, (N, N)
     mixed: Array  # shapes by the modes of the tissue, (n, k)
+    kept: NDArray[np.int64]  # numbers of the modes among the shapes, (k - n_s,)
 
 
 def reduced_filter(
@@ -48,6 +49,7 @@ def reduced_filter(
     period: float,
     delay: int = 0,
     weight: float = 1.0,
+    kept: NDArray[np.int64] | None = None,
 ) -> ReducedFilter:
     """The filter of N states, sampled every ``period`` [s]. Collective.
 
@@ -56,6 +58,7 @@ def reduced_filter(
         N: states, those of the hand included, even.
         delay: ticks that samples come late.
         weight: factor of the noise that stands for what the shapes leave out.
+        kept: numbers of the modes among the shapes; None: those of :func:`kept_modes`.
 
     Raises ControlError: there are no N states, the tissue has no damping, or no filter exists.
     """
@@ -66,7 +69,7 @@ def reduced_filter(
     delta = np.diag(modes.D) / 2
     if not delta.min() > 0:
         raise ControlError(f"the mode at {modes.omega[int(delta.argmin())]:.4g}/s has no damping; an observer needs it")
-    kept = kept_modes(modes, k - n_s)
+    kept = kept_modes(modes, k - n_s) if kept is None else kept
     mixed = np.hstack([np.eye(n)[:, kept], static_shapes(modes.omega, modes.g, kept)])
     plant, shapes = galerkin(problem, modes.Phi @ mixed)
     seen, moved = (total(comm, part) for part in sensors.of(modes.Phi))
@@ -80,7 +83,7 @@ def reduced_filter(
     noise = np.vstack([factor.hand, np.zeros((k, factor.columns)), mixed.T @ loads])
     A, B, f, P, M = on_root(comm, lambda: _stationary(plant, C, noise, V, period))
     own = Filter(A, B, f, C, M, sensors.names, sensors.speed, delay)
-    return ReducedFilter(own, plant, shapes, V, left / period, P, mixed)
+    return ReducedFilter(own, plant, shapes, V, left / period, P, mixed, kept)
 
 
 def kept_modes(modes: ModalPlant, count: int) -> NDArray[np.int64]:

@@ -43,6 +43,26 @@ def test_loop_with_observer_is_as_fast_as_with_the_state_known(Q: str, most: flo
     assert 0 < judged.excess <= most  # the least cost is that of the known state
 
 
+def test_modes_that_the_full_loop_shows_to_be_slow_take_the_place_of_others() -> None:
+    made, found, ticks = observed("control.Q=1e7")
+    acting = make_disturbance(made.problem, 0.02, 0.05, [[0, 0], [1, 0]])
+    first = reduced_filter(made.problem, found.loop.plant, found.sensors, acting, 14, 1e-3)
+    values = np.linalg.eigvals(loop_map(ticks, found.controller.K, first.filter).F)
+    assert found.judged.abscissa < 0.98 * found.judged.abscissa_known
+    assert np.log(np.abs(values).max()) / 1e-3 > 0.98 * found.judged.abscissa_known  # the modes by cost leave it slow
+    assert len(found.reduced.kept) == len(first.kept) == 3
+    assert set(found.reduced.kept) != set(first.kept)
+    assert found.weight < 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("Q", "most"), [("1.0", 0.002), ("1e6", 0.11)])
+def test_paper_mesh_has_a_fast_observer_of_14_states(Q: str, most: float) -> None:
+    judged = observed(f"control.Q={Q}", "tissue.cells=[10,20]")[1].judged
+    assert 0.98 < judged.abscissa / judged.abscissa_known < 1.02  # of the loop with the state known
+    assert 0 < judged.excess <= most
+
+
 def test_filter_that_ignores_what_it_leaves_out_spills_over() -> None:
     made, found, ticks = observed("control.Q=1e6")
     acting = make_disturbance(made.problem, 0.02, 0.05, [[0, 0], [1, 0]])
