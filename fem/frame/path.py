@@ -19,10 +19,10 @@ LARGEST_TURN = 0.5  # of a hand in a step [rad]: the iteration on the rest would
 
 @dataclass(frozen=True)
 class PathSteps:
-    """What the tissue feels of a known path; the turn of a step is that between its ends, accelerations are means."""
+    """Motion of a hand on a known path, as loads of the tissue need it; accelerations are means over a step."""
 
     spins: Array  # angular velocity in the hand's axes at the instants, (steps + 1, 3) [rad/s]
-    turns: Array  # mean angular velocity of each step, (steps, 3) [rad/s]
+    turns: Array  # angular velocity that turns the axes from start to end of each step, (steps, 3) [rad/s]
     felt: Array  # A - g and Omega' of each step, (steps, n_s) [m/s^2, rad/s^2]
     squared: Array  # (Omega x)^2 of each step, (steps, d, d) [1/s^2]
     mean: Array  # mean velocity of each step in the hand's axes, (steps, n_s) [m/s, rad/s]
@@ -62,7 +62,8 @@ def mean_wrench(masses: tuple[Array, Array, Array], g: Array, dt: float, q: Arra
         masses: of the hand, of the rigid tissue, and of the hand as far as it has weight, (n_s, n_s) each.
         g: gravity in space, (3,) [m/s2].
         dt: step [s].
-        q, v: [p; theta] and [p'; omega] in space, (steps + 1, n_s) each.
+        q: [p; theta] in space, (steps + 1, n_s) [m, rad].
+        v: [p'; omega] in space, (steps + 1, n_s) [m/s, rad/s].
         rows: numbers of :class:`softgrasp.fem.frame.integrals.Sums` at the steps, over all ranks, (steps + 1, m).
     """
     n_s = q.shape[1]

@@ -1,13 +1,13 @@
-"""A closed loop whose tissue meets obstacles that its design does not know.
+"""A closed loop whose tissue meets obstacles that its design does not contain.
 
 A step without contact is solved under the law first; then the obstacles press. A sampled input is known before the
-step, and nothing else changes. A continuous one sees the midpoint, which the forces x of the obstacles move:
+step, and nothing else changes. A continuous one depends on the midpoint, which the forces x of the obstacles move:
 
     u = clip(u_bar + K (x_mid(u, x) - x_bar)),   0 <= x,  g(u, x) >= 0,  x'g = 0   at the end of the step.
 
 Rounds solve it: each begins anew from the step without contact, moved by L^-1 (u - u_0), lets the obstacles press, and
-takes what the law then asks for by the secant method of Broyden [Broyden65], from (I - F L^-1)^-1 of the loop without
-contact. At the end law and contact hold together.
+updates the input towards that of the law by the secant method of Broyden [Broyden65], from (I - F L^-1)^-1 of the loop
+without contact. At the end both law and contact are satisfied.
 """
 
 from __future__ import annotations
@@ -35,7 +35,14 @@ CLOSE = 1e-11  # difference of input and law over the largest part of either, wh
 
 
 class TouchingDrive:
-    """A drive whose steps contact corrects; the histories are those of the drive."""
+    """A drive whose steps contact corrects; q, v and u are the arrays of the drive.
+
+    Attributes:
+        c: coefficients of the load G c of each step, (steps, n_s).
+        most: largest part of the input seen, the scale of `CLOSE` [N, N m].
+        w: half the change of z in the step without contact, on the rows here [m].
+        r: right-hand side of that step, on the rows here.
+    """
 
     def __init__(self, drive: GainDrive, contact: Contact, scene: Model) -> None:
         self.drive, self.contact, self.time, self.plant = drive, contact, scene.scene.time, drive.plant

@@ -1,7 +1,8 @@
-"""Full plant, observer and gain from tick to tick: is the loop stable, and what does it cost?
+"""Full plant, observer and gain from tick to tick: is the loop stable, and what is its cost?
 
-The reduced filter is stable on its own plant by design and says nothing of the modes that it leaves out. Here all modes
-stand, so that the spectrum is that of the whole loop. With the exact step of a tick, x+ = A x + B u + w, s = C x + v,
+The reduced filter is stable on its own plant by design, which proves nothing for the modes that it leaves out. Here
+all modes are kept, so that the spectrum is that of the whole loop. With the exact step of a tick, x+ = A x + B u + w,
+s = C x + v,
 
     F = the map of [x; m; inputs and samples on their way] over a tick,   S = (F - I)(F + I)^{-1},
 
@@ -36,18 +37,18 @@ class Ticks:
     """The full plant in energy-scaled modes from tick to tick, with what is measured and what disturbs."""
 
     A: Array  # state a tick later, (n, n)
-    B: Array  # of a held load, (n, n_s)
-    C: Array  # samples, (p, n)
+    B: Array  # state a tick later by a unit load held over the tick, (n, n_s)
+    C: Array  # samples of the state, (p, n)
     W: Array  # factor of the covariance that a tick adds, (n, r)
     sd: Array  # standard deviation of the samples, (p,)
-    y: Array  # outputs, (o, n)
+    y: Array  # outputs of the state, (o, n)
     period: float  # tick [s]
 
 
 def make_ticks(
     problem: RiccatiProblem, loop: ModalLoop, sensors: Sensors, disturbance: Disturbance, period: float
 ) -> Ticks:
-    """All modes over a tick. Collective."""
+    """Exact step of all modes over a tick of ``period`` seconds. Collective."""
     comm, modes, factor = problem.layout.comm, loop.plant, disturbance.factor
     seen, moved = (total(comm, part) for part in sensors.of(modes.Phi))
     C = np.hstack([sensors.C.hand.T, seen / modes.omega, moved])
@@ -110,7 +111,7 @@ class LoopMap:
 
     F: Array  # states a tick later, (k, k)
     noise: Array  # factor of the covariance that a tick adds, of disturbance and samples, (k, r + p)
-    estimate: Array  # x^ of the states, (N, k)
+    estimate: Array  # estimated state of the controller as a function of these states, (N, k)
     direct: Array  # factor of what the samples of this tick add to x^, (N, p)
 
 

@@ -16,7 +16,7 @@ from softgrasp.reduction import FullRun, full_run
 from softgrasp.study.report import Columns, percent
 from softgrasp.study.shell import RepeatableRun, processor_seconds
 
-FULL_REPEATS = 3  # behind the median of the full run
+FULL_REPEATS = 3  # runs of which the full run's time is the median
 PATIENCE = 2.0  # seconds of a full run above which few are enough
 ROUNDS, OFTEN = 9, 10  # in which both sides take turns, and reduced runs in each: one takes about a millisecond
 STEADY = 1.3  # ratio of the quartiles up to which a speed-up is named
@@ -29,25 +29,24 @@ class Timed(Protocol):
 
     @property
     def time_offline(self) -> float:
-        """Basis and model."""
+        """Time to make basis and model [s]."""
 
     @property
     def time_setup(self) -> float:
-        """A new parameter before its run."""
+        """Time to set up a new parameter before its run [s]."""
 
     @property
     def time_online(self) -> float:
-        """A whole run."""
+        """Time of a whole run [s]."""
 
 
 @dataclass(frozen=True)
 class SpeedUp:
     """The full model's time over that of a reduced one."""
 
-    again: float  # steps over a run of the same model again, both with everything prefactored
-    new: float  # factorisation and steps over set-up and run
-    # time_offline / (full run - reduced run) at new parameters; None when the reduced is not faster
-    break_even_runs: float | None
+    again: float  # ratio at the same parameter, of the steps alone [1]
+    new: float  # ratio at a new parameter, factorisation or set-up included [1]
+    break_even_runs: float | None  # runs at new parameters that save the offline time [1]; None where none is saved
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ class Spread:
     """A ratio over several rounds."""
 
     low: float  # lower quartile
-    median: float  # of all
+    median: float  # median of all rounds
     high: float  # upper quartile
 
     def __str__(self) -> str:
@@ -84,9 +83,9 @@ class Spread:
 class Turns:
     """Processor time of the full model over that of a reduced one, both sides in turn."""
 
-    again: Spread  # steps over a run of the same model again
-    new: Spread  # factorisation and steps over all that a reduced model does at a new parameter
-    rounds: int  # behind the quartiles
+    again: Spread  # ratio at the same parameter, of the steps alone [1]
+    new: Spread  # ratio at a new parameter, factorisation or set-up included [1]
+    rounds: int  # number of rounds that the quartiles are of
 
     @property
     def steady(self) -> bool:

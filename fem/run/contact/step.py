@@ -13,7 +13,14 @@ from softgrasp.fem.run.motion import ForceDrive, TableDrive
 
 
 class ContactDrive:
-    """A drive whose step without contact is corrected; the histories are those of the drive."""
+    """A drive whose step without contact is corrected.
+
+    Attributes:
+        q: displacement of the hand at each time, the array of the drive, (steps + 1, n_s) [m, rad].
+        v: velocity of the hand at each time, the same, (steps + 1, n_s) [m/s, rad/s].
+        c: coefficients of the load G c of each step, the same, (steps, n_s).
+        u: force on the hand in each step, the same, (steps, n_s) [N, N m].
+    """
 
     def __init__(self, drive: TableDrive | ForceDrive, contact: Contact) -> None:
         self.drive, self.contact = drive, contact
@@ -25,7 +32,10 @@ class ContactDrive:
         self.contact.press(n, self.drive)
 
     def check(self, begin: int, end: int) -> None:
-        """Look at the steps taken. Raises SolverError: see `ForceDrive.check`, or the hand itself met an obstacle."""
+        """Check the steps from begin to end.
+
+        Raises SolverError: see `ForceDrive.check`, or the hand itself met an obstacle.
+        """
         self.drive.check(begin, end)
         if isinstance(self.drive, ForceDrive):
             self.contact.check_hand(self.drive.q, begin, end)
