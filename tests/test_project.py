@@ -269,7 +269,7 @@ def test_wheel_is_one_package_and_does_not_ask_for_a_solver(wheel: Path) -> None
     outside = {path.name for path in BESIDE} - {path.name for path in SOURCES}
     assert {"riccati.py", "faults.py", "paper.py"} <= {path.name for path in BESIDE}
     assert not [n for n in names if re.search(r"bench|hardcases|(^|/)tests/", n) or n.rsplit("/", 1)[-1] in outside]
-    scenes = {f"softgrasp/scenes/{p.relative_to(SCENES)}" for p in SCENES.rglob("*") if p.is_file()}
+    scenes = {f"softgrasp/scenes/{p.relative_to(SCENES)}" for p in SCENES.rglob("*.*") if p.suffix != ".pyc"}
     modules = {str(p.relative_to(ROOT)) for p in SOURCES}
     assert modules | scenes | {"softgrasp/__init__.py", "softgrasp/py.typed"} <= names
     needed = re.findall(r"^Requires-Dist: ([\w.-]+)[^;\n]*$", metadata, re.MULTILINE)
