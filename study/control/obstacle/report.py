@@ -69,12 +69,13 @@ def sentence(study: PlannedStudy) -> str:
     paid = study.planned.runs.planned.cost
     more = f"{percent(study.excess)} more than that of the optimal feedback without obstacles and limits"
     cost = f"The cost of the plan is {paid:.4g}, {more}."
-    gap = "every gap" if study.named is None else f"every gap of {_nodes(study.named)}"
+    whose = "" if study.named is None else f" of {_nodes(study.named)}"
     if not plan.certified:
         run = "keeps" if study.kept else "does not keep"
-        return f"The plan is not certified: {plan.reason}. The full plant {run} {gap} in its run. {cost}"
-    other = "" if study.named is None else ", but for no other node"
-    return f"The full linear plant keeps {gap} and limit under the plan at every time: this is proved{other}. {cost}"
+        return f"The plan is not certified: {plan.reason}. The full plant {run} every gap{whose} in its run. {cost}"
+    kept = f"every limit, and every gap{whose}" if whose else "every gap and limit"
+    other = ", but for no other node" if whose else ""
+    return f"The full linear plant keeps {kept} under the plan at every time: this is proved{other}. {cost}"
 
 
 def facts(study: PlannedStudy) -> list[tuple[str, str]]:

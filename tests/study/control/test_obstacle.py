@@ -65,7 +65,7 @@ def test_page_of_named_nodes_speaks_of_them_alone(tmp_path: Path) -> None:
     assert found["body"] == [[0.5, 0.0]]
     assert min(found["gap_min"]) >= 0 > -0.1 > max(found["gap_min_boundary"])
     assert (
-        "keeps every gap of the node at (0.5, 0) and limit under the plan at every time: this is proved, but for no"
+        "keeps every limit, and every gap of the node at (0.5, 0) under the plan at every time: this is proved, but"
         in words
     )
     assert "which the plan does not look at" in words
