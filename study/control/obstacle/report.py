@@ -22,7 +22,7 @@ CAPTIONS = {
     "where they are not the whole boundary. What moves is drawn at the same instants.",
     "gaps.png": "Gap of the body to every obstacle on the full plant, with a band of three standard deviations where "
     "an observer keeps it on its way under noise. Dashed: clearance and margins, which the reduced plant keeps; the "
-    "full plant may use the margins up. Where `control.constraints.body` gives nodes, gaps are theirs. Below: force "
+    "full plant may use the margins up. Where control.constraints.body gives nodes, gaps are theirs. Below: force "
     "and speed of the hand with their limits.",
     "times.png": "Times of the quadratic program in Python, without a guess and from the active rows of a plan nearby, "
     "against a tick of the loop and the interval after which the next plan is due.",
