@@ -145,15 +145,21 @@ def bode(margins: LoopMargins) -> Any:
         return figure
 
 
-def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Frames) -> list[Path]:
-    """All figures but that of the re-tuning, and the animation. Rank 0 only."""
+def draw_move(out: Path, study: ControlStudy, frames: Frames) -> list[Path]:
+    """The move as picture and animation, and its histories. Rank 0 only."""
     design, loops, full = study.design, study.loops, study.loops.full
     files = _move(out, study, frames) if frames.picture is not None and frames.states else []
     figure = histories(
         full.times, full.outputs, full.inputs, full.columns, target=design.target.y, limits=loops.limits,
         others=compared(loops), settle=loops.plan.settle, dimension=design.problem.layout.dimension,
     )  # fmt: skip
-    files += style.save(figure, out / "histories.png")
+    return [*files, *style.save(figure, out / "histories.png")]
+
+
+def draw_loop(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Frames) -> list[Path]:
+    """Figures of gains, margins, contact, plan and poles; not that of the re-tuning. Rank 0 only."""
+    files: list[Path] = []
+    loops, full = study.loops, study.loops.full
     if any(b.reports for b in study.bases):
         files += figure_gains(study.bases, out / "errors.png")
     if study.margins is not None:

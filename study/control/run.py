@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack, cast
 
@@ -204,17 +205,20 @@ def with_retuning(model: Model, study: ControlStudy, watch: Stopwatch, bar: Prog
 
 
 def _drawn(session: Session, study: ControlStudy, frames: Frames) -> Callable[[], list[Path]]:
-    """Begin to draw on rank 0. Collective."""
+    """Begin to draw on rank 0, in two processes: nothing else is left to compute. Collective."""
     if not session.pictures:
         return list
     poles = measure.pole_sets(study)
+    if session.comm.rank != 0:
+        return list
+    from softgrasp.study.control.plots import draw_loop, draw_move  # brings Matplotlib, once for both processes
 
-    def draw(out: Path) -> list[Path]:
-        from softgrasp.study.control.plots import draw_all  # brings Matplotlib
-
-        return draw_all(out, study, poles, frames)
-
-    return draw_in_background(session.comm, session.out, draw)
+    parts = (
+        partial(draw_move, study=study, frames=frames),
+        partial(draw_loop, study=study, poles=poles, frames=frames),
+    )
+    begun = [draw_in_background(session.comm, session.out, draw) for draw in parts]
+    return lambda: [file for files in begun for file in files()]
 
 
 def unused_rate(model: Model) -> str:
