@@ -1,4 +1,4 @@
-"""Measurements that tell most about some parameters: sums of their information with the largest determinant."""
+"""Measurements that determine some parameters best: sums of their information with the largest determinant."""
 
 from __future__ import annotations
 

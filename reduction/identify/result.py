@@ -32,7 +32,7 @@ class Identified(Shown):
     parts: dict[str, Array | None]
     """Estimated relative error (k,) [1] of the values by "mesh", "time step", "reduction", "linear elasticity", signed.
 
-    What each makes of value / truth - 1, the proof of a certified model without a sign; None where it is not known.
+    What each makes of log(value / truth), the proof of a certified model without a sign; None where it is not known.
     Linear elasticity is named where finite strain changes more than nothing, and values are linear all the same.
     """
     kinds: dict[str, str]

@@ -50,7 +50,7 @@ class MotionPlan:
 
 @dataclass(frozen=True, repr=False)
 class SuggestedMarkers(Shown):
-    """Markers and a motion that tell most about a material; made by :func:`suggest_markers`."""
+    """Markers and a motion that determine a material best; made by :func:`suggest_markers`."""
 
     unknowns: tuple[Unknown, ...]
     """Names and units of what is to be fitted, (k,)."""

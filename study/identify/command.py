@@ -49,7 +49,7 @@ def identify(
         ),
     ] = None,
     suggest_markers: Annotated[
-        int | None, typer.Option(help="no fit: choose so many markers that would tell most", min=1)
+        int | None, typer.Option(help="no fit: choose so many markers that would determine the values best", min=1)
     ] = None,
     motions: Annotated[
         list[str] | None, typer.Option(help="with --suggest-markers: motions to choose from, as in duration=0.5;1;2")

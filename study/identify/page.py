@@ -38,7 +38,8 @@ def compose(answer: Identified, session: Session, fitted: Path, options: str) ->
         Section("", figures=figures[:1]),
         of_scene(answer.scene),
         value_table(answer).section(
-            f"Noise: standard deviation. {kinds_sentence(answer)} Signed parts are those of value / truth - 1.",
+            f"Noise: standard deviation. {kinds_sentence(answer)} Errors are of the logarithm; signed parts are those "
+            "of log(value / truth).",
             terminal=True, figures=figures[1:2],
         ),
         sight_table(answer).section("A deviation above 100 % is no knowledge."),

@@ -1,4 +1,4 @@
-"""``softgrasp identify --suggest-markers K``: places of markers and a motion that tell most about the material."""
+"""``softgrasp identify --suggest-markers K``: the markers and the motion that determine the material best."""
 
 from __future__ import annotations
 
