@@ -44,7 +44,8 @@ spent = time.process_time() - begin
 full = sg.simulate(model.with_materials(lam=77.0, mu=60.0))
 if speak:
     proof = answer.certificate
-    print(f"error of the reduction at most {proof.reduction:.2%}, of the time step about {proof.time_step:.2%}")
+    reduction, time_step = 100 * proof.reduction, 100 * proof.time_step
+    print(f"error of the reduction at most {reduction:.2f} %, of the time step about {time_step:.2f} %")
     print(f"{1e3 * spent:.0f} ms of processor time")
 
 # %% [markdown]

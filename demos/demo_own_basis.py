@@ -40,7 +40,7 @@ for method in METHODS:
 if speak:
     print(f"{'basis':18s}" + "".join(f"{f'N = {N}':>10s}" for N in SIZES))
     for method in METHODS:
-        cells = (f"{error[method, N]:.2%}" if stable[method, N] else "unstable" for N in SIZES)
+        cells = (f"{100 * error[method, N]:.2f} %" if stable[method, N] else "unstable" for N in SIZES)
         print(f"{method:18s}" + "".join(f"{cell:>10s}" for cell in cells))
 figure, axis = plt.subplots(figsize=(7, 3), layout="constrained")
 for method in METHODS:

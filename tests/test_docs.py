@@ -366,6 +366,7 @@ def test_pages_build_strictly(tmp_path: Path) -> None:
     for name in ("Trajectory", "LoopTrajectory", "METHODS"):
         assert re.search(rf'id="softgrasp[\w.]*\.{name}"', api), f"api.md lacks {name}"
     assert all(f"sg.{name}" in api or f">{name}<" in api for name in sg.__all__), "api.md lacks a name of the face"
+    assert not re.search(r"<td><code>(?:<[^>]+>)?_[a-z]", api), "api.md lists a private field"
 
 
 def test_limits_of_the_page_of_costs_are_those_of_the_source() -> None:

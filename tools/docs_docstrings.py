@@ -26,9 +26,11 @@ class PlainDocstrings(Extension):
 
 
 def field_comments(cls: Class) -> dict[str, str]:
-    """The comment beside each field, or the lines above it."""
+    """The comment beside each public field, or the lines above it."""
     comments = {}
     for name, field in cls.attributes.items():
+        if name.startswith("_"):
+            continue
         beside = re.search(r"  # (.+)$", "".join(field.lines[-1:]))
         above = list(
             takewhile(lambda line: line.strip().startswith("# "), cls.lines[field.lineno - cls.lineno - 1 :: -1])
