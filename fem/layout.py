@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.shown import Shown
 
+NEAR = 0.05  # of the longest side: how far outside the body a point may be that was read off a picture
 Place = tuple[tuple[float, ...], int, int]  # of a node: coordinates [m], owning rank, its number there
 
 
@@ -69,6 +70,16 @@ class BlockLayout(Shown):
     def bounds(self) -> tuple[Array, Array]:
         """Lowest and highest coordinates of the free nodes [m]. Collective."""
         return bounding_box(self.comm, self.nodes)
+
+    def body_bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest coordinates of all nodes, also of those that follow the hand [m]. Collective."""
+        return bounding_box(self.comm, np.vstack([self.nodes, self.held]))
+
+    def near_body(self, point: Array) -> bool:
+        """Whether a point [m] lies in the bounding box of the body or not far outside. Collective."""
+        low, high = self.body_bounds()
+        slack = NEAR * float((high - low).max())
+        return bool(((point >= low - slack) & (point <= high + slack)).all())
 
     def rounded(self, lengths: Array) -> Array:
         """Lengths on a decimal grid of about 1e-9 of the body, so that rounding makes no difference."""

@@ -10,7 +10,6 @@ import numpy as np
 
 from softgrasp.fem.columns import Columns, hand_columns, labels
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.scene.scene import Scene
@@ -45,15 +44,14 @@ def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
 
     Raises SceneError: a node lies outside the body or a region has no node.
     """
-    entries = scene.control.outputs if scene.control is not None else []
-    if not entries:
+    control = scene.control
+    if control is None or not control.outputs:
         _, far = system.layout.nearest_nodes(system.layout.nodes, system.layout.reference, farthest=True)
         which = "the free one" if len(far) == 1 else f"one of the {len(far)} free ones"
         tip = _node(system, "tip", np.asarray(far[0][0]))
         return (replace(tip, place=f"node {_coordinates(tip.point)}, {which} farthest from the hand"),)
     result = []
-    for i, output in enumerate(entries):
-        name = output.name or f"y{i + 1}"
+    for i, (name, output) in enumerate(zip(control.output_names, control.outputs, strict=True)):
         if output.kind == "hand":
             n_s, d = system.layout.n_s, system.layout.dimension
             result.append(Output(name, hand_columns(n_s, d, name), np.zeros((0, n_s), int), 0.0, np.eye(n_s)))
@@ -123,11 +121,8 @@ def _region(system: BlockSystem, name: str, box: Array, i: int) -> Output:
 
 
 def _inside(system: BlockSystem, point: list[float], i: int) -> None:
-    layout = system.layout
-    low, high = bounding_box(layout.comm, np.vstack([layout.nodes, layout.held]))  # whole sides may be bonded
-    p = np.asarray(point, dtype=float)
-    slack = 0.05 * float((high - low).max())  # a point that was read off a picture
-    if (p < low - slack).any() or (p > high + slack).any():
+    if not system.layout.near_body(np.asarray(point, dtype=float)):
+        low, high = system.layout.body_bounds()
         raise SceneError(
             f"control.outputs[{i}].point = {list(point)} lies outside the body, which spans "
             f"{(np.round(low, 6) + 0.0).tolist()} to {(np.round(high, 6) + 0.0).tolist()} m"  # + 0: no -0.0

@@ -310,9 +310,14 @@ class Control(Section):
         None, description="Kalman filter of the tissue from markers and forces [various]; off unless given"
     )
 
+    @property
+    def output_names(self) -> list[str]:
+        """Names of the outputs, y1, y2, .. by number where none is given."""
+        return [output.name or f"y{i + 1}" for i, output in enumerate(self.outputs)]
+
     @model_validator(mode="after")
     def _check(self) -> Control:
-        names = [output.name or f"y{i + 1}" for i, output in enumerate(self.outputs)]
+        names = self.output_names
         for i, name in enumerate(names):
             if name in names[:i]:
                 raise ValueError(f"outputs[{names.index(name)}] and outputs[{i}] are both named {name}; name one anew")

@@ -32,7 +32,7 @@ class Task:
     bounded: bool = True  # whether ``error`` is a proved bound
     penalty: float | None = None  # cost of a metre inside an obstacle [1/m]; None: many times that of the way
     paths: tuple[Path | None, ...] = ()  # translation of each obstacle; empty where all are fixed
-    extent: float = 0.0  # longest side of the body where only few of its nodes keep gaps; 0: that of ``places`` [m]
+    extent: float = 0.0  # longest side of the body [m]; 0: that of ``places``, where all keep gaps
 
     @property
     def size(self) -> float:

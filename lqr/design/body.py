@@ -12,7 +12,6 @@ from softgrasp.lqr.constrained.tissue import Surface, make_surface
 from softgrasp.lqr.design.scene import control_of
 from softgrasp.lqr.plant.checks import ControlError
 
-NEAR = 0.05  # of the longest side that a point may lie outside the body: it was read off a picture
 SAME = 1e-6  # of the longest side, between a node and its place in an output
 KEY = "control.constraints.body"
 
@@ -26,13 +25,12 @@ def body_surface(model: Model) -> Surface:
     surface = make_surface(layout, *model.space.surface())
     if given is None or given.body == "boundary":
         return surface
-    nodes, low, high = layout.rounded(surface.nodes), surface.nodes.min(axis=0), surface.nodes.max(axis=0)
-    slack = NEAR * float((high - low).max())
+    nodes = layout.rounded(surface.nodes)
     kept: list[int] = []
     for i, entry in enumerate(given.body):
         key = f"{KEY}[{i}] = {entry!r}"
         point = _point(model, entry, key)
-        if not ((point >= low - slack) & (point <= high + slack)).all():
+        if not layout.near_body(point):
             raise ControlError(f"{key} lies outside the body; move it there")
         distance = layout.rounded(np.linalg.norm(surface.nodes - point, axis=1))
         at = np.flatnonzero(distance == distance.min())
@@ -49,7 +47,9 @@ def _point(model: Model, entry: str | list[float], key: str) -> Array:
     """Of the node of an output, or as it is given [m]. Collective."""
     layout = model.system.layout
     if isinstance(entry, str):
-        outputs = {o.name or f"y{i + 1}": o.point for i, o in enumerate(control_of(model).outputs) if o.kind == "node"}
+        control = control_of(model)
+        named = zip(control.output_names, control.outputs, strict=True)
+        outputs = {name: output.point for name, output in named if output.kind == "node"}
         if entry not in outputs:
             raise ControlError(f"{key} is no output of kind node; these are {', '.join(outputs) or 'none'}")
         return np.asarray(layout.nearest_node(np.asarray(outputs[entry], dtype=float))[2])

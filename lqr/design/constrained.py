@@ -161,7 +161,7 @@ def plan_control(
         task = Task(
             begin, target, design.target.u, bodies, names, error, given.clearance + estimated, limits, noise,
             given.margin == "bound", penalty, tuple(o.path for o in obstacles),
-            0.0 if near is surface else plant.layout.extent,
+            float(np.ptp(surface.nodes, axis=0).max()),
         )  # fmt: skip
         steps = first_horizon(design.model, plant)
         longest = None if given.horizon == "auto" else steps

@@ -134,10 +134,10 @@ def observe(design: Design, watch: Stopwatch) -> ObservedControl:
 class _Candidate:
     """A filter, judged on the full plant."""
 
-    weight: float
-    reduced: ReducedFilter
-    controller: Controller
-    judged: Judged
+    weight: float  # factor of the noise that stands for what the filter leaves out
+    reduced: ReducedFilter  # the filter on its own plant
+    controller: Controller  # gain and filter
+    judged: Judged  # their loop with the full plant
 
 
 def _with_other_modes(

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.fem.columns import AXES
-from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
@@ -102,9 +101,7 @@ def _marker(problem: RiccatiProblem, point: Array, i: int) -> tuple[Array, Array
     layout, d = problem.layout, problem.layout.dimension
     if point.shape != (d,):
         raise ControlError(f"control.observer.markers[{i}] = {point.tolist()} must have {d} entries")
-    low, high = bounding_box(layout.comm, np.vstack([layout.nodes, layout.held]))
-    slack = 0.05 * float((high - low).max())  # a point that was read off a picture
-    if not ((point >= low - slack) & (point <= high + slack)).all():
+    if not layout.near_body(point):
         raise ControlError(f"control.observer.markers[{i}] = {point.tolist()} lies outside the body; move it there")
     rank, first, where = layout.nearest_node(point)
     owns, column = layout.comm.rank == rank, np.zeros((layout.n_local, d))

@@ -42,7 +42,7 @@ def compose(answer: Identified, session: Session, fitted: Path, options: str) ->
             "of log(value / truth).",
             terminal=True, figures=figures[1:2],
         ),
-        sight_table(answer).section("A deviation above 100 % is no knowledge."),
+        sight_table(answer).section("A combination with a deviation above 100 % is not determined by the data."),
         *([assumed_table(answer).section(ASSUMED, terminal=True)] if answer.assumed else []),
         *([nuisance_table(answer).section(terminal=True)] if answer.nuisances else []),
         *([posterior_table(answer).section(posterior_sentence(answer), terminal=True)] if answer.posterior else []),

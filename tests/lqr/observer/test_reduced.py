@@ -13,6 +13,7 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import Stopwatch, build
+from softgrasp.fem.petsc import total
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.design.feedback import Design, design
 from softgrasp.lqr.design.observer import ObservedControl, observe
@@ -171,10 +172,11 @@ def test_cost_and_deviations_are_those_of_another_lyapunov_solver() -> None:
     assert abs(judged.cost_known / least - 1) < 3e-4  # the law is held for a millisecond, which costs 1.5e-4
 
 
+@pytest.mark.ranks(2)
 def test_what_a_long_tick_adds_is_the_integral_over_it() -> None:
     made, found, plant = observed("control.loop.rate=5.0")  # the fastest mode turns eight times in a tick
     acting, modes = make_disturbance(made.problem, 0.02, 0.05, [[0, 0], [1, 0]]).factor, found.loop.plant
-    loads = modes.Phi.T @ acting.parts[3]
+    loads = total(made.problem.layout.comm, modes.Phi.T @ acting.parts[3])
     G = np.linalg.solve(modes.space.E, np.vstack([acting.hand, np.zeros_like(loads), loads]))
     points, weights = np.polynomial.legendre.leggauss(120)  # more than four a turn of what is integrated
     exact = np.zeros_like(plant.A)
