@@ -11,6 +11,9 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.obstacles import replace_paths
 from softgrasp.fem.scene.scene import Scene
 
+LATER = (("control", "constraints", "body", "boundary"),)
+"""Keys that tables got later, with their defaults: at these they do not count, so that scenes keep their hashes."""
+
 
 def scene_hash(scene: Scene, without: Iterable[str] = ("name", "description")) -> str:
     """SHA-256 of the resolved scene, of the contents of its mesh file and of the bytes of its csv files, 64 hex digits.
@@ -55,6 +58,12 @@ def _resolved(scene: Scene, without: Iterable[str]) -> dict[str, Any]:
     if motion.get("csv") is not None:
         motion["csv"] = _digest(scene, motion["csv"], "motion.csv")
     replace_paths(data, lambda name: _digest(scene, name, "csv of an obstacle's path"))
+    for *tables, key, default in LATER:
+        inner = data
+        for table in tables:
+            inner = inner.get(table) or {}
+        if inner.get(key) == default:
+            del inner[key]
     return data
 
 
