@@ -19,17 +19,17 @@ from softgrasp.fem.errors import meet
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 SAME = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
-FEW_COLUMNS = 2  # up to which setting up a product of matrices needs more time than it saves
-BLOCK_COLUMNS = 8  # at least so many of a block
-FEW_ENTRIES = 524_288  # of eight columns and more, up to which SciPy's product is the faster one
-BLOCK_ENTRIES = 131_072  # about so many of a block of columns: memory that the C library has at hand
+FEW_COLUMNS = 2  # up to so many columns setting up a product of matrices needs more time than it saves
+BLOCK_COLUMNS = 8  # least number of columns of a block
+FEW_ENTRIES = 524_288  # up to so many entries of eight columns and more SciPy's product is the faster one
+BLOCK_ENTRIES = 131_072  # approximate number of entries of a block, whose memory the C library keeps for reuse
 
 
 @contextmanager
 def petsc_options(prefix: str, entries: dict[str, object]) -> Iterator[None]:
     """Set prefixed options but those of the user, and remove them again: the database is global.
 
-    Options of a factor are read at its set-up, so that belongs into the block.
+    A factor reads its options at its set-up, which therefore has to be inside the block.
     """
     database = PETSc.Options(prefix)
     ours = {key: value for key, value in entries.items() if not database.hasName(key)}
@@ -48,7 +48,7 @@ def user_options(prefix: str = "softgrasp_") -> list[str]:
 
 
 def from_options(solver: Any) -> None:
-    """Let the user's options for the prefix of a solver (KSP, EPS, SVD) win; nothing without any. Collective."""
+    """Apply the user's options for the prefix of a solver (KSP, EPS, SVD) over ours, if there are any. Collective."""
     if user_options(solver.getOptionsPrefix()):
         solver.setFromOptions()
 
@@ -206,7 +206,7 @@ def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:
 
 
 def to_ranks(comm: MPI.Intracomm, rank: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Send each of these rows (k, ...) to a rank, and return those that come here. Collective."""
+    """Send row i of ``rows`` (k, ...) to rank ``rank[i]``; return the rows sent here, by sender. Collective."""
     width = int(np.prod(rows.shape[1:]))
     counts = width * np.bincount(rank, minlength=comm.size).astype(np.int64)
     coming = np.empty_like(counts)

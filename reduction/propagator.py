@@ -54,18 +54,22 @@ def rotation(angle: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class StepCoordinates:
-    """x = X w, with what is known of a step in w."""
+    """Coordinates w of a state, x = X w, in which the step of every pair of modes is a plane rotation."""
 
     X: Array  # columns of the coordinates, x = X w, (N, k)
     X_inverse: Array  # coordinates of a state, w = X_inverse x, (k, N)
-    omega: Array  # angular frequencies of the pairs of modes that follow each other from ``first`` on, (m,) [1/s]
-    first: int = 0  # number of the first mode
-    # number of coordinates after the modes that nothing moves; the modes then move each other alone. None when other
-    # coordinates may move the modes.
+    omega: Array  # angular frequencies of the pairs of modes, w[first : first + 2 m] pair by pair, (m,) [1/s]
+    first: int = 0  # index in w of the first mode
+    # number of constant coordinates after the modes; None where other coordinates may enter the rates of the modes
     still: int | None = None
 
     def fix(self, P: Array, angle: Array, often: bool) -> None:
-        """Overwrite the modes by plane rotations, well rounded ones if applied again and again."""
+        """Overwrite the rows of the modes in P (k, k) by plane rotations, in place.
+
+        Args:
+            angle: angle of each rotation, (m,) [rad].
+            often: whether P is applied again and again: then c^2 + s^2 = 1 as :func:`rotation` makes it.
+        """
         if not len(angle):
             return
         c, s = rotation(angle) if often else (np.cos(angle), np.sin(angle))
@@ -83,13 +87,14 @@ class Modal:
     """Steps of w = [pairs; still; free], mode by mode."""
 
     angle: Array  # angle of a step, one for each pair [rad], (m,)
-    # from i inputs and a constant 1 to dt g / (1 - i omega dt / 2), real and imaginary rows by turns, (2 m, i + 1)
+    # matrix from p inputs and a constant 1 to dt g / (1 - i omega dt / 2), real and imaginary rows in turn, (2m, p + 1)
     load: Array
-    rest: Array  # from i inputs and a constant 1 to dt g of all other coordinates, (still + free, i + 1)
-    pull: Array  # of pairs and still ones on the free ones in a step, w_f += pull (w_n + w_{n+1}), (free, 2 m + still)
+    rest: Array  # matrix from p inputs and a constant 1 to dt g of all other coordinates, (still + free, p + 1)
+    # action of pairs and still ones w_m on the free ones in a step, w_f += pull (w_m,n + w_m,n+1), (free, 2 m + still)
+    pull: Array
 
     def march(self, inputs: Array, start: Array) -> Array:
-        """States w of all steps, (steps + 1, k), for inputs (steps, i) and a start (k,)."""
+        """States w of all steps, (steps + 1, k), for inputs (steps, p) and a start (k,)."""
         steps, pairs, moved = len(inputs), 2 * len(self.angle), self.pull.shape[1]
         w = np.empty((steps + 1, len(start)))
         turn = turns(self.angle, steps)
@@ -145,7 +150,7 @@ class Propagator(MidpointSteps):
 
     @property
     def stable(self) -> bool:
-        """Nothing grows: by structure where the modes are known, else by the eigenvalues of the model."""
+        """Whether no free motion grows: by structure where the modes are known, else by the model's eigenvalues."""
         return self.modal is not None or self.model.stable
 
     def march(self, inputs: Array, start: Array) -> Array:
@@ -153,7 +158,7 @@ class Propagator(MidpointSteps):
         return super().march(inputs, start) if self.modal is None else self.modal.march(inputs, start)
 
     def exact(self, P: Array, steps: int) -> Array:
-        """Entries of P^steps that are known: rotations, and the free hand."""
+        """``P``, a computed power P^steps, with its known entries set in place: rotations, and the free hand."""
         self.at.fix(P, steps * 2 * np.arctan(self.at.omega * self.dt / 2), steps in (1, self.steps))
         if self.model.hand_first and not (self.model.two_way or self.driven):
             k = 2 * self.model.n_s
@@ -197,8 +202,8 @@ def _tissue(model: EnergySystem, apart: bool) -> StepCoordinates:
 def _whole(model: EnergySystem) -> StepCoordinates | None:
     """Coordinates w = [modes; still; free] of a conservative model with its hand inside, H = |modes, still|^2 / 2.
 
-    H is semidefinite: displacements of the free hand cost nothing. With H = y'y / 2, y = R x and y' = R E^-1 A R^+ y, a
-    skew matrix, whose null vectors are constant (a hand that coasts). The null space of H is moved but moves nothing.
+    H is semidefinite: displacements of the free hand have no energy. With H = y'y / 2, y = R x and y' = R E^-1 A R^+ y,
+    a skew matrix, whose null vectors are constant (a hand that coasts). The null space of H is moved but moves nothing.
     None when the numbers do not have the structure.
     """
     H = model.H

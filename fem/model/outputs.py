@@ -18,12 +18,12 @@ from softgrasp.fem.system import BlockSystem
 
 @dataclass(frozen=True)
 class Output:
-    """One named output y = C_e z + C_s q_s with d (or, for the hand, n_s) components [m; angles rad]."""
+    """One named output y = C_e z + C_s q_s of tissue z and hand q_s, d components (n_s if of the hand) [m; rad]."""
 
     name: str  # label in tables and files
     columns: Columns  # label and unit of each component
     dofs: np.ndarray  # local tissue dofs that enter, shape (k, size); empty on ranks that own none
-    weight: float  # every listed dof enters with this factor
+    weight: float  # factor of every listed dof, 1 / number of nodes [1]
     C_s: Array  # rigid part, (size, n_s), on every rank
     point: tuple[float, ...] = ()  # coordinates [m] of the node, or of the centre of the region
     place: str = ""  # the chosen node, or the nodes of the mean, in words; empty for the hand
@@ -78,10 +78,10 @@ def _node(system: BlockSystem, name: str, point: Array) -> Output:
     owns = layout.comm.rank == rank
     dofs = np.arange(first, first + d)[None, :] if owns else np.zeros((0, d), int)
     C_s = layout.comm.bcast(system.T[first : first + d].copy() if owns else None, root=rank)
-    return Output(name, hand_columns(d, d, name), dofs, 1.0, C_s, tuple(where.tolist()), _taken(system, point, where))
+    return Output(name, hand_columns(d, d, name), dofs, 1.0, C_s, tuple(where.tolist()), _place(system, point, where))
 
 
-def _taken(system: BlockSystem, point: Array, where: Array) -> str:
+def _place(system: BlockSystem, point: Array, where: Array) -> str:
     """The node nearest to a point, and the number of others as near, in words. Collective."""
     layout = system.layout
     (least, equal), (nearer, _) = (layout.nearest_nodes(nodes, point) for nodes in (layout.nodes, layout.held))
@@ -100,9 +100,8 @@ def _coordinates(point: Sequence[float] | Array) -> str:
 def _region(system: BlockSystem, name: str, box: Array, i: int) -> Output:
     layout = system.layout
     d = layout.dimension
-    slack = 1e-9 * max(
-        layout.extent, float(np.abs(box).max())
-    )  # a node on the edge of the box is inside, rounded or not
+    # a node on the edge of the box is inside, rounded or not
+    slack = 1e-9 * max(layout.extent, float(np.abs(box).max()))
 
     def within(nodes: Array) -> Any:
         return np.flatnonzero(((nodes >= box[0] - slack) & (nodes <= box[1] + slack)).all(axis=1))

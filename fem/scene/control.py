@@ -132,7 +132,7 @@ class Loop(Section):
 
 
 def _with_hyphen(method: str) -> str:
-    """The one way in which a scene is hashed and written."""
+    """Name of a solver with hyphens, "newton-adi": the one spelling in the hash and the file of a scene."""
     return method.replace("_", "-")
 
 
@@ -157,6 +157,7 @@ Weight = float | list[list[float]]
 
 
 def _check_weight(key: str, weight: Weight, definite: bool) -> None:
+    """Raises ValueError: a weight is no symmetric matrix, or not positive definite (else semidefinite)."""
     word = "> 0" if definite else ">= 0"
     if isinstance(weight, list):
         if any(len(row) != len(weight) for row in weight) or not weight:
@@ -176,7 +177,7 @@ def _check_weight(key: str, weight: Weight, definite: bool) -> None:
 
 
 class Constraints(Section):
-    """Plan of held forces that keeps [[obstacle]] and the limits of the hand, and the margins it takes."""
+    """Plan of piecewise constant forces past every [[obstacle]], within the limits of the hand, with its margins."""
 
     force: Positive | list[Positive] | None = Field(
         None, description="largest force on the hand in each direction [N], one number or one per axis; none by default"
@@ -196,8 +197,8 @@ class Constraints(Section):
     )
     finite_strain: bool = Field(
         False,
-        description="with effects.finite_strain: measure what the linear plant errs under the plan, an estimate, "
-        "and plan again with it as a further margin [no unit]",
+        description="with effects.finite_strain: estimate the error of the linear plant under the plan, and plan "
+        "again with it as a further margin [no unit]",
     )
     noise: NonNegative = Field(
         3.0,

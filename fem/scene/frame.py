@@ -8,7 +8,12 @@ from softgrasp.fem.scene.tissue import Tissue
 
 
 def check_frame(effects: Any, tissue: Tissue) -> None:
-    """ValueError for what ``effects.frame`` cannot go with, in a table of effects or in the tissue."""
+    """Raises ValueError: effects or tissue have what ``effects.frame = "hand"`` cannot be combined with.
+
+    Args:
+        effects: the section :class:`softgrasp.fem.scene.scene.Effects` of the scene.
+        tissue: its section of the tissue.
+    """
     if not effects.rotation:
         raise ValueError("effects.frame is 'hand' but effects.rotation is off; set effects.rotation to true")
     if effects.obstacles:
@@ -17,5 +22,5 @@ def check_frame(effects: Any, tissue: Tissue) -> None:
         raise ValueError("effects.damping.drag = 'space' cannot go with effects.frame yet; use drag = 'hand'")
     if tissue.refine is not None and tissue.refine.tolerance is not None:
         raise ValueError(
-            "tissue.refine.tolerance cannot go with effects.frame, which its estimate does not include; drop it"
+            "tissue.refine.tolerance cannot go with effects.frame, as its estimate leaves out large rotations; drop it"
         )

@@ -321,7 +321,7 @@ def _check_contact(scene: Scene) -> None:
         raise ValueError("obstacle is missing; effects.obstacles needs at least one [[obstacle]]")
     if scene.tissue.refine is not None and scene.tissue.refine.tolerance is not None:
         raise ValueError(
-            "tissue.refine.tolerance cannot go with effects.obstacles, which its estimate does not include; drop it"
+            "tissue.refine.tolerance cannot go with effects.obstacles, as its estimate leaves them out; drop it"
         )
     if scene.effects.finite_strain is not None:
         _check_finite(scene, scene.obstacle)

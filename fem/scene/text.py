@@ -56,7 +56,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError:
         raise
     except RecursionError:
-        raise ValueError(f"has too many brackets in each other; at most {DEEPEST} have a meaning") from None
+        raise ValueError(f"has too many nested brackets; at most {DEEPEST} have a meaning") from None
     except ValueError:  # Python's limit on the digits of an integer
         raise ValueError("has an integer of thousands of digits; integers lie between -2^63 and 2^63") from None
 

@@ -36,13 +36,12 @@ class QuadraturePoints:
     d: int  # space dimension
     law: str | Law  # name of the material's law, or a law of the user's own
     tol: float  # relative tolerance of the equations of a step [1]
-    own: Callable[[QuadraturePoints, tuple[LayerMaterial, ...]], tuple[Array, ...]] | None = (
-        None  # moduli of an own law
-    )
+    # function from the points and the layers' materials to the inputs of an own law, (Q,) each; None for a named law
+    own: Callable[[QuadraturePoints, tuple[LayerMaterial, ...]], tuple[Array, ...]] | None = None
 
     @property
     def laws(self) -> Law:
-        """The law itself."""
+        """The law, by its name where it has one."""
         return LAWS[self.law] if isinstance(self.law, str) else self.law
 
     def moduli(self, materials: tuple[LayerMaterial, ...]) -> tuple[Array, ...]:
@@ -81,7 +80,8 @@ def make_gradient(comm: MPI.Intracomm, gradients: Array, nodes: Ints, columns: t
 def node_arrays(points: QuadraturePoints, lanes: int) -> tuple[Any, Array, int, int]:
     """Nodes of the points and gradients of their shape functions, by chunks of ``lanes`` points, B on one rank.
 
-    Returns node (p, k) and dN_a / dX_j (p, k, d) with the points of a chunk last, as `force.c` reads them, k and p.
+    Returns numbers of the nodes, (p / lanes, k, lanes), dN_a / dX_j, (p / lanes, k, d, lanes), as `force.c` reads them,
+    the number k of nodes of a point, and the number p of points, rounded up to whole chunks.
     """
     B, d, Q = to_scipy(points.B), points.d, len(points.vol)
     counts = np.diff(B.indptr[: Q + 1])  # the rows of a point have the same nodes
@@ -97,9 +97,9 @@ def node_arrays(points: QuadraturePoints, lanes: int) -> tuple[Any, Array, int, 
 
 
 def whole_points(points: QuadraturePoints, comm: MPI.Intracomm, columns: Ints | None = None) -> QuadraturePoints:
-    """All points on this rank alone, the columns of B in another order. Collective.
+    """The points of all ranks on every rank, as a matrix B of that rank alone. Collective.
 
-    ``columns``: number of each column in the layout's order; None keeps it.
+    ``columns``: number of the present column for each new column of B; None keeps the order.
     """
     every = whole_copy(points.B)
     B = to_scipy(every)

@@ -118,7 +118,7 @@ def plan_control(
         notify: called with the number of steps of the full plant done and in all.
         observed: the observer of the scene, whose feedback keeps the plant near to the plan.
         online: whether the controller that plans again is made and run.
-        estimated: further margin, for what the linear plant errs [m].
+        estimated: further margin, for the error of the linear plant [m].
 
     Raises:
         ControlError: the plant has no plan, the target keeps no gap or limit, or a key is missing.

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from softgrasp.fem.columns import Array, Columns, labels
 from softgrasp.fem.errors import SceneError, no_pipe, shortened
 
-FEWEST = 8  # measured numbers: fewer say nothing about their own noise
+FEWEST = 8  # measured numbers; with fewer the noise cannot be estimated
 FAR = 1000.0  # lengths of the body: a marker farther away has another unit
 TURN = 4 * np.pi  # largest angle of an output [rad]: larger ones are degrees
 TIMES = ("time [s]", "t [s]", "time", "t")
@@ -23,15 +23,15 @@ TIMES = ("time [s]", "t [s]", "time", "t")
 class Measurements:
     """Outputs of one experiment at instants of their own."""
 
-    name: str  # of the file
-    times: Array  # instants, increasing, (m,) [s]
+    name: str  # name of the file
+    times: Array  # instants of the samples, increasing, (m,) [s]
     values: Array  # outputs in the order of the scene, nan where nothing was measured, (m, p) [m, rad]
-    # measured hand instead of the scene's: times (k,) [s] and positions (k, n_s) [m, rad]; None takes the scene's
+    # measured hand: times (k,) [s] and positions (k, n_s) [m, rad]; None for the hand of the scene
     hand: tuple[Array, Array] | None = None
 
     @property
     def seen(self) -> np.ndarray:
-        """Where there is a number, (m, p)."""
+        """Whether an output was measured at an instant, (m, p)."""
         return np.isfinite(self.values)
 
 
@@ -81,7 +81,7 @@ def read_measurements(path: Path, outputs: Columns, hand: Columns, end: float, s
 
 
 def _places(path: Path, head: Sequence[str], columns: Columns) -> list[int]:
-    """Of each column of the file, that of the table: 0 is the time."""
+    """Number of the column of the table for each column of the file; 0 is the time."""
     names = {name: 1 + i for i, c in enumerate(columns) for name in (c.label, f"{c.label} [{c.unit}]")}
     wanted = ", ".join(f"{c.label} [{c.unit}]" for c in columns)
     if not head or head[0] not in TIMES:
@@ -90,7 +90,7 @@ def _places(path: Path, head: Sequence[str], columns: Columns) -> list[int]:
         raise SceneError(f"{path}: '{shortened(wrong)}' is no output of the scene; the columns can be {wanted}")
     places = [names[name] for name in head[1:]]
     if len(set(places)) < len(places):
-        raise SceneError(f"{path}: a column stands twice; the columns can be {wanted}")
+        raise SceneError(f"{path}: a column is given twice; the columns can be {wanted}")
     return [0, *places]
 
 
@@ -109,7 +109,16 @@ def _number(path: Path, line: int, cell: str) -> float:
 
 
 def check(what: str, data: Measurements, end: float, size: float, outputs: Columns) -> None:
-    """Refuse data that nothing can be identified from. Raises SceneError: with one sentence."""
+    """Refuse data that nothing can be identified from.
+
+    Args:
+        what: name of the data in the sentence.
+        end: end of the hand's motion [s].
+        size: length of the body [m].
+        outputs: those of the scene, one for each column of ``data.values``.
+
+    Raises SceneError: with one sentence.
+    """
     seen, times = data.seen, data.times
     if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
         raise SceneError(f"{what}: times must be finite and increase from one to the next")
@@ -137,8 +146,8 @@ def check(what: str, data: Measurements, end: float, size: float, outputs: Colum
         raise SceneError(f"{what}: no output moves; nothing can be identified from constants")
 
 
-def told_apart(many: Sequence[Measurements]) -> tuple[Measurements, ...]:
-    """The same with names that differ: what stands twice gets a number."""
+def with_distinct_names(many: Sequence[Measurements]) -> tuple[Measurements, ...]:
+    """The same data; a name that several have gets a number, "camera.csv (2)"."""
     names = [data.name for data in many]
     seen: dict[str, int] = {}
     result = []

@@ -26,7 +26,7 @@ from softgrasp.fem.model.build import MeshEstimate, Model
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.strain.laws import LAWS, LawName
-from softgrasp.reduction.identify.data import Measurements, check, parse_noise, read_measurements, told_apart
+from softgrasp.reduction.identify.data import Measurements, check, parse_noise, read_measurements, with_distinct_names
 from softgrasp.reduction.identify.fit import Fit, Linearisation, Nuisances, by_experiment, fit_rounds, linearise
 from softgrasp.reduction.identify.near import Experiment, Local, Near, check_identifiable, experiment, moved_as
 from softgrasp.reduction.identify.parts import (
@@ -118,7 +118,7 @@ def identify(
     many = [data] if isinstance(data, Measurements | str | Path) else list(data)
     if not many:
         raise SceneError("identify: there are no measurements; give at least one file")
-    read = told_apart([_measurements(model, each) for each in many])
+    read = with_distinct_names([_measurements(model, each) for each in many])
     done = 0
 
     def tick(_: int) -> None:

@@ -15,9 +15,12 @@ BEHIND = 1e-3  # depth behind the plane of the body, over its size [1]
 
 
 def solids(obstacles: tuple[Obstacle, ...], t: float, box: Array, flat: bool) -> Any:
-    """One mesh of all obstacles at a time, as far as they lie around corners ``box`` (2, 3) [m]; None without any.
+    """One triangulated surface (PyVista) of all obstacles near the body; None without any.
 
-    ``flat``: the body lies in a plane; then the obstacles do, just behind it.
+    Args:
+        t: time [s].
+        box: lower and upper corner of the body, (2, 3) [m].
+        flat: whether the body lies in a plane; then the obstacles do, just behind it.
     """
     import pyvista
 
@@ -38,7 +41,7 @@ def solids(obstacles: tuple[Obstacle, ...], t: float, box: Array, flat: bool) ->
 
 
 def _flat(obstacle: Obstacle, t: float, box: Array, size: float) -> Any:
-    """An obstacle of the plane."""
+    """Polygon of an obstacle of the plane; ``box``: corners of what is shown, (2, 2), ``size`` of the body [m]."""
     import pyvista
 
     shape, shift = obstacle.shape, np.zeros(2) + obstacle.shift(t)
@@ -55,7 +58,7 @@ def _flat(obstacle: Obstacle, t: float, box: Array, size: float) -> Any:
 
 
 def _solid(obstacle: Obstacle, t: float, box: Array, size: float) -> Any:
-    """An obstacle in space."""
+    """Surface of an obstacle in space; ``box``: corners of the body, (2, 3), ``size`` of the body [m]."""
     import pyvista
 
     shape, shift = obstacle.shape, np.zeros(3) + obstacle.shift(t)

@@ -19,8 +19,8 @@ from softgrasp.fem import Array
 from softgrasp.study.pictures import shapes
 
 TEMPLATE = Path(__file__).with_name("turning.html")
-MOST_BYTES = 12_000_000  # of places; above, instants are left out
-LEVELS = 65535  # of a place: 2e-5 of the scene
+MOST_BYTES = 12_000_000  # of all coordinates in the page; above, instants are left out
+LEVELS = 65535  # steps of a coordinate over the largest side of the scene
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Scene3D:
     title: str  # of the field, with unit
     ends: tuple[float, float]  # values at both ends of the colours
     obstacles: Sequence[Array] = ()  # corners of triangles (j, 3, 3) [m]: none, one for all instants, or one each
-    flat: bool = False  # seen from above
+    flat: bool = False  # whether it is seen from above
 
     def html(self) -> str:
         """The page; every place is right to 1.6e-5 of the largest side of the scene."""

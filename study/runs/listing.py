@@ -21,7 +21,9 @@ from softgrasp.study.report import Page, Section, Table, in_words
 from softgrasp.study.shell import Session, folder_lock, read_result
 
 ALIKE = 1e-12  # relative difference below which two numbers count as equal: rounding
-COST = re.compile(r"(^|[._])(time(?!_error|_step)|seconds|memory)")  # names of what every run has anew
+COST = re.compile(
+    r"(^|[._])(time(?!_error|_step)|seconds|memory)"
+)  # names of times and memory, which differ from run to run
 LONGEST = 6  # entries of a list that is compared entry by entry
 LIST_WIDTH = 200  # [letters]
 FOREIGN = 5  # files that a list of runs leaves out by name
@@ -63,12 +65,12 @@ def runs_below(folder: Path) -> tuple[Table, list[Path]]:
 
 
 def _number(value: Any) -> bool:
-    """Whether a table can show it."""
+    """Whether it is a number that a table can show."""
     return type(value) in (int, float) and abs(value) < LARGEST
 
 
 def flat(data: Any, at: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names and values of nested tables; short lists entry by entry."""
+    """Dotted names and values of nested tables, pair by pair; short lists entry by entry."""
     if isinstance(data, dict):
         for key, value in data.items():
             yield from flat(value, f"{at}.{key}" if at else str(key))
@@ -120,7 +122,7 @@ def _flat(file: Path, data: dict[str, Any]) -> dict[str, Any]:
     try:
         return dict(flat(data))
     except RecursionError:
-        raise SceneError(f"{file} has too many brackets in each other; run the scene again") from None
+        raise SceneError(f"{file} has too many nested brackets; run the scene again") from None
 
 
 def _scene(file: Path) -> dict[str, Any]:
@@ -138,7 +140,7 @@ def _scene(file: Path) -> dict[str, Any]:
 
 
 def _traces(a: Path, b: Path) -> tuple[list[str], np.ndarray, np.ndarray] | None:
-    """Shared columns of both trajectory.csv, time first and velocities left out."""
+    """Labels, and rows of both runs, of the columns that both trajectory.csv have: time first, no velocities."""
     tables = []
     for folder in (a, b):
         if not (folder / "trajectory.csv").exists():
@@ -175,7 +177,7 @@ def apart(traces: tuple[list[str], np.ndarray, np.ndarray] | None) -> str:
         return ""
     names, a, b = traces
     if a.shape != b.shape or not np.allclose(a[:, 0], b[:, 0]):
-        return "The trajectories have other time steps; the picture shows both."
+        return "The trajectories have different time steps; the picture shows both."
     most: dict[str, float] = {}
     for name, size in zip(names[1:], np.nanmax(np.abs(a - b), axis=0)[1:], strict=True):
         unit = name.rpartition("[")[2].rstrip("]")

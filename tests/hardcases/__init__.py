@@ -1,1 +1,1 @@
-"""`softgrasp hardcases`: stay stable or refuse with a reason."""
+"""`python -m tests.hardcases`: runs that stay within a bound, or are refused with a reason."""

@@ -15,7 +15,7 @@ from softgrasp.reduction.identify.data import (
     interpolation,
     parse_noise,
     read_measurements,
-    told_apart,
+    with_distinct_names,
 )
 
 TIP, HAND = hand_columns(2, 2, "tip"), hand_columns(2, 2, "q")
@@ -53,7 +53,7 @@ def test_columns_may_stand_in_any_order_and_cells_may_be_empty(tmp_path: Path) -
         (["tip_x,tip_y", "1,2"], "the first column must be 'time [s]'"),
         (["time [s],nose_x [m]", "0,1"], "'nose_x [m]' is no output of the scene; the columns can be tip_x [m]"),
         (["time [s],tip_x [mm]", "0,1"], "'tip_x [mm]' is no output"),
-        (["t,tip_x,tip_x [m]", "0,1,1"], "a column stands twice"),
+        (["t,tip_x,tip_x [m]", "0,1,1"], "a column is given twice"),
         (["t,tip_x,tip_y", *rows(3), "0.2,1,1", *rows()], "line 5: times must be given in each line and increase"),
         (["t,tip_x,tip_y", *rows(3), ",1,1"], "line 5: times must be given"),
         (["t,tip_x,tip_y", *rows(3), "0.9,1"], "line 5 has 2 cells; it must have 3"),
@@ -132,6 +132,6 @@ def test_angles_are_compared_with_turns_and_not_with_lengths(tmp_path: Path) -> 
         read_measurements(degrees, turning, HAND, 1.0, 2.0)
 
 
-def test_files_of_one_name_are_told_apart() -> None:
+def test_files_of_one_name_get_numbers() -> None:
     one, other = (Measurements(name, np.zeros(0), np.zeros((0, 2))) for name in ("camera.csv", "other.csv"))
-    assert [d.name for d in told_apart([one, other, one])] == ["camera.csv (1)", "other.csv", "camera.csv (2)"]
+    assert [d.name for d in with_distinct_names([one, other, one])] == ["camera.csv (1)", "other.csv", "camera.csv (2)"]

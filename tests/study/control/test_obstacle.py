@@ -91,7 +91,7 @@ def test_plan_of_the_linear_plant_runs_at_finite_strain(tmp_path: Path) -> None:
         tmp_path / "hard", finite, "tissue.cells=[2,4]", "tissue.material={lambda=500.0,mu=500.0,rho=1.0}"
     )
     errors = [result["obstacle"]["finite_strain"]["error"] for result in (soft, hard)]
-    # deformations of the stiffer tissue are a tenth, the linear plant errs by their square: 0.29 mm and 4 um
+    # deformations of the stiffer tissue are a tenth, the error of the linear plant is of their square: 0.29 mm and 4 um
     assert 0 < errors[1] < 0.03 * errors[0] < 0.03 * 1e-3
     found = soft["obstacle"]["finite_strain"]
     assert found["violation"] == max(0.0, -min(found["gap_min"]))
