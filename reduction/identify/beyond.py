@@ -108,27 +108,45 @@ def refused(answer: Identified, part: Array, why: str) -> Identified:
 
 
 def chosen(linear: Identified, strained: Identified, part: Array, failed: str = "") -> Identified:
-    """The answer at finite strain, unless the data speak for linear elasticity; says which and why.
+    """The answer of the law that the data speak for; says which and why. In a tie linear, with both fits' difference.
+
+    S is the sum of squares of a fit, D^2 = |y - y'|^2 / sigma^2 the distance of two fits. If the first law is true,
+    S - S' is normal with mean -D^2 and deviation 2 D [C62]; it exceeds c^2 where a standard normal number exceeds
+    (c^2 + D^2) / (2 D) >= c. So the law with the larger S is refuted by ``CHANCE`` deviations, whatever D is, where the
+    sums differ by more than ``CHANCE``^2; where they do not, either may be true.
 
     ``failed``: why it has no reduced model at finite strain, but full runs and slopes of linear elasticity.
     """
-    misfits = f"{strained.residuals.misfit:.3g} sigma against {linear.residuals.misfit:.3g}"
-    if _squares(strained) - _squares(linear) > CHANCE**2:
+    misfits = f"misfit {strained.residuals.misfit:.3g} sigma against {linear.residuals.misfit:.3g}"
+    more = _squares(strained) - _squares(linear)
+    runs = linear.runs + strained.runs
+    if more > CHANCE**2:
         sentence = (
-            f"Finite strain ({strained.law}) matters at these strains, and fits worse (misfit {misfits}): the values "
-            "are those of linear elasticity."
+            f"Finite strain ({strained.law}) matters at these strains, and fits worse ({misfits}): the values are "
+            "those of linear elasticity."
         )
-        return replace(linear, warnings=(*linear.warnings, sentence))
+        return replace(linear, warnings=(*linear.warnings, sentence), runs=runs)
+    if more >= -(CHANCE**2):
+        change = np.log(linear.values / strained.values)
+        i = int(np.argmax(np.abs(change) / linear.noise))
+        sentence = (
+            f"Finite strain ({strained.law}) changes {linear.unknowns[i].name} by about {percent(abs(change[i]))}, and "
+            f"the data do not decide between it and linear elasticity ({misfits}; the sums of squares differ by "
+            f"{abs(more):.2g}, by chance up to {CHANCE**2:g}): the values are those of linear elasticity, and the "
+            "change is a part of their errors."
+        )
+        kinds = linear.kinds | {LINEAR: f"difference to the fit with the law {strained.law}"}
+        answer = replace(linear, parts=linear.parts | {LINEAR: change}, kinds=kinds)
+        return replace(answer, warnings=(*linear.warnings, sentence), runs=runs)
     i = int(np.argmax(np.abs(part) / linear.noise))
     sentence = (
-        f"{_beyond(linear, part, i)}: the values are those of finite strain with the law {strained.law} (misfit "
-        f"{misfits}); another law has others."
+        f"{_beyond(linear, part, i)}: the values are those of finite strain with the law {strained.law} ({misfits}); "
+        "another law has others."
     )
     if failed:
         sentence += (
             f" They come from full runs and slopes of linear elasticity, for no reduced model runs there: {failed}"
         )
-    runs = linear.runs + strained.runs
     history = (*linear.history, *strained.history[1:])
     return replace(strained, warnings=(sentence, *strained.warnings), runs=runs, history=history)
 

@@ -95,7 +95,8 @@ def identify(
         robust: a loss that gives outliers little weight.
         refine: refine the mesh, and the time step, where they exceed the noise.
         law: "linear" elasticity, or a hyperelastic law by hyper-reduced models; "auto" is that of the scene, and uses
-            "neo-hooke" where finite strain changes a linear value by more than the noise and fits no worse.
+            "neo-hooke" where finite strain changes a linear value by more than the noise and the data speak for it;
+            where they do not decide, the values are linear and the difference is a part of their errors.
         certified: a certified model of the scene, or its file: its basis serves for all values, its bound is the part
             of the reduction. Linear elasticity alone.
         posterior: samples of the posterior by emcee, which check the covariance; 0: none.

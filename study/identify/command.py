@@ -72,7 +72,8 @@ def identify(
     Refused, with exit status 3: a misfit beyond chance, a mesh or time step that changes a value by more than the noise
     (--refine mends both), a direction that the data do not determine, a fit that does not converge.
 
-    Where linear elasticity is beyond its range, the fit is made at finite strain, with reduced models of full runs.
+    Where linear elasticity is beyond its range, the fit is made at finite strain, with reduced models of full runs;
+    where the data do not decide between both, the values are linear and the difference is a part of their errors.
 
     Example: softgrasp identify my.toml camera.csv --fit mu,lambda,beta --noise 1e-3
 

@@ -18,7 +18,7 @@ CAPTIONS = {
     "fit.png": "Above: measured outputs (dots) and the fit (lines), of each experiment. Below: residuals over the "
     "stated standard deviation of the noise; the grey band holds 95 % of white noise.",
     "ellipses.png": "Pairs of values: change against the answer. Ellipses: 68 and 95 % of the noise. Lines to a dot: "
-    "the answer without the error of the mesh, of the time step, of the reduction; no dot: it lies outside.",
+    "the answer without one of the other parts of its error; no dot: it lies outside.",
     "history.png": "Values after each round over the final ones; a round is a fit with one reduced model.",
 }
 ASSUMED_ERROR = 0.1

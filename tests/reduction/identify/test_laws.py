@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from softgrasp.reduction.identify.beyond import linear_range
 from softgrasp.reduction.identify.data import Measurements
 from softgrasp.reduction.identify.fit import Misfit, Nuisances
 from softgrasp.reduction.identify.near import Near, experiment
-from softgrasp.reduction.identify.unknowns import parse_unknowns
+from softgrasp.reduction.identify.unknowns import parse_unknowns, scene_at, value_of
 
 pytestmark = pytest.mark.serial
 TRUTH = {"mu": 70.0, "beta": 0.025}
@@ -87,6 +88,44 @@ def test_linear_data_keep_linear_values_whatever_the_strain() -> None:
     assert found.warnings[-1].startswith("Finite strain (neo-hooke) matters at these strains, and fits worse")
     assert "linear elasticity" not in found.parts
     assert (np.abs(errors(found)) < 2 * found.total).all()
+
+
+@pytest.mark.parametrize("law", [NEO, ""])
+def test_laws_that_explain_the_data_alike_leave_linear_values_and_their_difference_as_a_part(
+    law: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Data of either law, with noise that hides which of them it was: 2 cm of 20 cm."""
+    sure, noise = automatic(), 2e-2
+    monkeypatch.setattr("softgrasp.reduction.identify.strained.Strained._around", fails)  # full runs are quicker
+    found = sg.identify(model(), data(noise, law), "mu,beta", noise)
+    assert (found.law, found.reasons) == ("linear", ())
+    assert found.warnings[-1].startswith("Finite strain (neo-hooke) changes beta by about 4.")
+    assert "the data do not decide between it and linear elasticity" in found.warnings[-1]
+    part = found.parts["linear elasticity"]
+    without = replace(found, parts={name: x for name, x in found.parts.items() if name != "linear elasticity"})
+    assert found.kinds["linear elasticity"] == "difference to the fit with the law neo-hooke"
+    assert np.abs(part[1]) > found.noise[1]  # else one run at finite strain is the part, without a second fit
+    # what linear fits differ by from those at finite strain where the noise is half as large, up to their misfit
+    linear = sg.identify(model(), data(1e-2), "mu,beta", 1e-2, law="linear")
+    assert part == pytest.approx(np.log(linear.values / sure.values), abs=0.02)  # 4 % of beta is the largest
+    assert found.total - without.total == pytest.approx(np.abs(part))
+    assert (np.abs(np.log(found.values / list(TRUTH.values()))) < 2 * found.total).all()
+
+
+@pytest.mark.slow  # two layers, whose values are three times as far as the noise from each other: 30 s
+def test_two_layers_under_linear_data_have_the_truth_within_their_errors() -> None:
+    layers, fine = (
+        sg.build("layers_2d", ["output.snapshots='none'", *keys])
+        for keys in ([], ["tissue.order=3", "time.steps=1600"])
+    )
+    unknowns = parse_unknowns(["mu", "fat.mu"], layers)
+    truth = np.array([1.3, 1.5]) * [value_of(layers.system.materials, u) for u in unknowns]
+    run = sg.simulate(sg.build(scene_at(fine.scene, unknowns, truth)))
+    y = run.outputs[::8]
+    noisy = Measurements("skin", run.times[::8], y + np.random.default_rng(0).normal(0, 3e-5, y.shape))
+    found = sg.identify(layers, noisy, "mu,fat.mu", 3e-5)
+    assert (found.law, found.reasons) == ("linear", ())
+    assert (np.abs(np.log(found.values / truth)) < found.total).all()
 
 
 def test_finite_strain_that_the_noise_hides_is_a_part_of_the_error() -> None:
