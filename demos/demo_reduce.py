@@ -26,7 +26,10 @@ for method in ("psd", "psd_svd_like", "craig_bampton"):
     off[method] = error.error_deformation
     if speak:
         stable = rom.at().stable
-        print(f"{method:14s} stable {stable}, deformation {error.error_deformation:.1e}, state {error.error:.1e}")
+        print(
+            f"{method:14s} stable {stable}, error of the deformation {100 * error.error_deformation:.2g} %, "
+            f"of the state {100 * error.error:.2g} %"
+        )
 assert off["craig_bampton"] < 0.01 < off["psd"]  # PSD in the plain product spends its columns on the translation
 
 # %% [markdown]

@@ -219,11 +219,14 @@ def control_rows(control: dict[str, Any]) -> list[Row]:
         (f"speed-up, POD of P, N = {first['N']}", "1600", digits(gained),
          less(-gained, -1600) if useful(first) else UNKNOWN,
          "the full equation is solved in low rank; both need P for the basis" if useful(first) else USELESS),
-        ("target reached at T = 300, optimal gain", "yes", f"{digits(away)} m off", verdict((away or 1.0) < NEAR), ""),
+        ("target reached at T = 300, optimal gain", "yes", f"distance {digits(away)} m",
+         verdict((away or 1.0) < NEAR), ""),
     ]  # fmt: skip
     for run in control["loop"].get("reduced", ()):
         named = run["method"] == "pod"
-        end = run["reason"] or f"{digits(run['distance_final'])} m off, excess cost {digits(run['cost'] / best - 1)}"
+        end = (
+            run["reason"] or f"distance {digits(run['distance_final'])} m, excess cost {digits(run['cost'] / best - 1)}"
+        )
         name = f"target reached, {TITLES[run['method']]}, N = {run['N']}"
         same = verdict(not run["reason"]) if named else UNKNOWN
         rows.append(

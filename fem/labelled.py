@@ -125,7 +125,7 @@ class FullOrderRun(Labelled):
     energy: Array
     """Energy of the deformation, (steps + 1,) [J]."""
     dissipated: Array
-    """Energy that damping has taken, (steps + 1,) [J]."""
+    """Energy dissipated by damping, (steps + 1,) [J]."""
 
     @property
     def output_names(self) -> tuple[str, ...]:

@@ -158,7 +158,7 @@ class BlockSystem(Shown):
     def with_materials(self, materials: tuple[LayerMaterial, ...]) -> BlockSystem:
         """The same scene with other lambda, mu, rho, beta: a few axpy, no assembly. Collective.
 
-        Raises SceneError: a parameter of an own energy changes that the stiffness is not affine in.
+        Raises SceneError: a parameter of an own energy changes, and the stiffness is not affine in it.
         """
         if text := differs(materials, self.materials):
             raise SceneError(text)

@@ -76,7 +76,7 @@ def test_page_has_every_row(tmp_path: Path, results: dict[str, dict[str, Any]]) 
     assert control["POD of P, N = 8: error of P"] == "not finite"
     assert control["POD of P, N = 8: full closed loop"] == "not stable"
     assert control["speed-up, POD of P, N = 8"] == "500"
-    assert control["target reached, POD of P, N = 16"] in ("0.0002 m off, excess cost 0.1", "not stable")
+    assert control["target reached, POD of P, N = 16"] in ("distance 0.0002 m, excess cost 0.1", "not stable")
     assert control["smallest error of P at N = 8"] == "inf without, 0.25 with"
     verdicts = {row["quantity"]: row["verdict"] for rows in found.values() for row in rows}
     assert verdicts["full run, 600 steps"] == "better"

@@ -213,7 +213,7 @@ def test_models_without_motion_or_scenes_are_named(tmp_path: Path, monkeypatch: 
     with h5py.File(tmp_path / "m.h5", "w"):
         pass
     monkeypatch.setattr("softgrasp.study.serve.run.load_certified", lambda _: SimpleNamespace(drive=None))
-    with pytest.raises(SoftgraspError, match=r"m\.h5 holds no motion; reduce its scene again"):
+    with pytest.raises(SoftgraspError, match=r"m\.h5 has no motion; reduce its scene again"):
         served_model(tmp_path / "m.h5", "mu")
     monkeypatch.setattr("softgrasp.fem.scene.file.shipped_scenes", dict)
     with pytest.raises(SoftgraspError, match="no scenes here: they ship with the checkout, in demos/scenes"):

@@ -103,7 +103,7 @@ def scene_keys(schema: dict[str, Any]) -> str:
     """All keys of a scene, a table a section, from the JSON schema."""
     text = [
         "# Scene keys",
-        "A scene is a TOML file. Every key has a unit; what is not given takes its default. `softgrasp schema` "
+        "A scene is a TOML file. Every key has a unit; what is not given has its default. `softgrasp schema` "
         "prints the same as a JSON schema, which editors use to complete and check keys.",
     ]
     seen: list[str] = []
@@ -122,7 +122,7 @@ def scene_keys(schema: dict[str, Any]) -> str:
         text.append(f"## `{path or 'top of the file'}`" if path else "## Top of the file")
         if path and table.get("description"):
             text.append(_safe(table["description"].split("\n\n")[0].replace("\n", " ")))
-        text.append("\n".join(["| key | takes | default | meaning |", "| --- | --- | --- | --- |", *rows]))
+        text.append("\n".join(["| key | value | default | meaning |", "| --- | --- | --- | --- |", *rows]))
         for where, _, part in below:
             section(where, part)
 

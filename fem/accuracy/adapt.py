@@ -21,6 +21,7 @@ from softgrasp.fem.model.build import build as build_on
 from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import as_overrides, load_scene_collective
+from softgrasp.fem.shown import percent
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene
@@ -176,8 +177,8 @@ def _check_steps(scene: Scene, tolerance: float, error: float) -> None:
     if error > tolerance:
         steps = int(scene.time.steps * (2 * error / tolerance) ** 0.5) + 1
         raise SceneError(
-            f"tissue.refine.tolerance = {tolerance:g} is below the error {error:.1e} that time.steps = "
-            f"{scene.time.steps} leave on any mesh: use at least {steps} steps or a larger tolerance."
+            f"tissue.refine.tolerance = {tolerance:g} is below the error of {percent(error)} that "
+            f"time.steps = {scene.time.steps} leave on any mesh: use at least {steps} steps or a larger tolerance."
         )
 
 

@@ -105,7 +105,7 @@ def check_straight(points: Floats, cells: Integers, shape: str, kind: str, name:
         place = place_text(points[where[worst]])
         text = (
             f"{name} has {counted(int(curved.sum()), 'curved cell')} of type {kind}, the worst node lies "
-            f"{off[worst]:.3g} m off its straight edge or flat face ({relative[worst]:.3g} of the longest edge) "
+            f"{off[worst]:.3g} m from its straight edge or flat face ({relative[worst]:.3g} of the longest edge) "
             f"at {place}"
         )
         simple = order == 2 and size == len(edges) + count and count == DIMENSIONS[shape] + 1

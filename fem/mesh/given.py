@@ -88,7 +88,7 @@ def with_given_mesh(
 
 
 def _entities(topology: dolfinx.mesh.Topology) -> list[int]:
-    """Numbers of vertices and cells on this rank and on all, which tell two meshes apart."""
+    """Numbers of vertices and cells on this rank and on all, which distinguish two meshes."""
     maps = [topology.index_map(dimension) for dimension in (0, topology.dim)]
     return [number for each in maps for number in (each.size_local, each.size_global)]
 

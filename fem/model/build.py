@@ -275,7 +275,7 @@ def checked_model(model: object) -> Model:
     if isinstance(model, Model):
         return model
     shown = f'"{model}"' if isinstance(model, str) else "scene" if isinstance(model, Scene) else type(model).__name__
-    raise SceneError(f"a model is needed; write softgrasp.build({shown}) where {shown} stands")
+    raise SceneError(f"a model is needed; give softgrasp.build({shown}) in place of {shown}")
 
 
 def _assembled(

@@ -135,7 +135,7 @@ class Coulomb:
             others = (self._pivot, self._grow) if self.m == 1 else (self._grow, self._pivot)
             if not any(other(W, q, mu, tol) for other in others):
                 raise SolverError(
-                    f"the friction of {k} nodes has no solution that {SWEEPS} sweeps find; take more time.steps, or "
+                    f"the friction of {k} nodes has no solution that {SWEEPS} sweeps find; raise time.steps, or use "
                     "less friction"
                 )
         return self.x

@@ -162,8 +162,8 @@ def check_passage(
             longest = float(way[near].max())
             raise SolverError(
                 f"obstacle '{obstacle.name}' has a thickness or radius of {size:.2g} m, and from t = {times[0]:.6g} s "
-                f"on a node beside it moves by {longest:.2g} m in one step: it could pass through; take at least "
-                f"{math.ceil(longest / size)} times as many time.steps"
+                f"on a node beside it moves by {longest:.2g} m in one step: it could pass through; raise "
+                f"time.steps by a factor of at least {math.ceil(longest / size)}"
             )
 
 

@@ -105,7 +105,7 @@ class SmallProblem:
         """The sentence on p rows for which the rounds do not end."""
         return (
             f"the contact problem of {p} rows has no solution that {self.most * p} rounds find; obstacles that "
-            "leave the tissue no room are the usual reason: move one, or take more time.steps"
+            "leave the tissue no room are the usual reason: move one, or raise time.steps"
         )
 
     def _in_c(self, p: int, W: Array, q: Array, tol: float) -> int:
@@ -196,7 +196,7 @@ class DependentProblem(SmallProblem):
                 before, x = x, super().solve(p, W, right, tol / 2).copy()
                 if np.abs(more * (x - before)).max(initial=0.0) <= tol / 2:
                     return x
-        raise SolverError(f"contact: {PASSES} passes leave the forces of {p} points open; take fewer obstacle.parts")
+        raise SolverError(f"contact: {PASSES} passes leave the forces of {p} points open; lower obstacle.parts")
 
 
 @contextmanager

@@ -177,7 +177,7 @@ class Hdf5Store(NoStore):
             raise CheckpointError(f"{path} cannot be read ({error}); run again without --resume") from error
         if stored != shape:
             raise CheckpointError(
-                f"{path} holds {stored} numbers, this run needs {shape}; resume with the same scene and rank count, or "
+                f"{path} has {stored} numbers, this run needs {shape}; resume with the same scene and rank count, or "
                 "run again without --resume"
             )
 
@@ -219,7 +219,7 @@ class Hdf5Store(NoStore):
             )
         if self.on_file < self.written:
             raise CheckpointError(
-                f"{path} holds {self.on_file} snapshots, step {step} needs {self.written}; run again without --resume"
+                f"{path} has {self.on_file} snapshots, step {step} needs {self.written}; run again without --resume"
             )
         try:
             with h5py.File(path) as file:

@@ -61,7 +61,7 @@ class Trajectory(Shown, FullOrderRun):
     nothing for it.
     """
     dissipated: Array
-    """Energy that damping has taken up to each time, on every rank, (steps + 1,) [J]."""
+    """Energy dissipated by damping up to each time, on every rank, (steps + 1,) [J]."""
     final: Array
     """State [z; v_z] of this rank's nodes at the end, (2 n_local,) [m; m/s]."""
     energy_drift: float

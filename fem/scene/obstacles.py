@@ -77,7 +77,7 @@ class Obstacle(Section):
             if (getattr(self, key) is not None) != (key in keys):
                 needed = " and ".join(keys)
                 state = "is missing" if key in keys else f"does not go with kind = '{self.kind}'"
-                raise ValueError(f"{key} {state}; a {self.kind} takes {needed}")
+                raise ValueError(f"{key} {state}; a {self.kind} needs {needed}")
         if self.friction and self.parts is not None:
             raise ValueError("parts cannot go with friction, which acts on nodes alone; drop one of them")
         if self.normal is not None and not any(self.normal):
@@ -148,7 +148,7 @@ def check_obstacle_vectors(obstacles: list[Obstacle] | None, d: int) -> None:
     for i, obstacle in enumerate(obstacles or []):
         if (own := DIMENSION.get(obstacle.kind, d)) != d:
             other = next(kind for kind, each in DIMENSION.items() if each == d and KEYS[kind] == KEYS[obstacle.kind])
-            raise ValueError(f"obstacle.{i}.kind is '{obstacle.kind}', of {own}D; in this {d}D scene take '{other}'")
+            raise ValueError(f"obstacle.{i}.kind is '{obstacle.kind}', of {own}D; in this {d}D scene use '{other}'")
         for key, vector in obstacle.vectors():
             if len(vector) != d:
                 raise ValueError(

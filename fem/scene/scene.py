@@ -241,7 +241,7 @@ class Scene(Shown, Section):
         return self.motion.duration if self.time.end is None else self.time.end
 
     def changed(self, edit: Callable[[dict[str, Any]], None]) -> Scene:
-        """A copy after ``edit`` changed the table of its keys in place. Raises ValidationError: it is no scene then."""
+        """A copy after ``edit`` changed the table of its keys in place. Raises ValidationError: it is not valid."""
         data = self.model_dump(mode="json", by_alias=True, exclude_none=True)
         edit(data)
         result = Scene.model_validate(data)

@@ -131,7 +131,7 @@ def read_table(path: Path, *columns: int) -> list[list[float]]:
         for j, value in enumerate(row):
             if bounds := ("finite numbers" if not math.isfinite(value) else out_of_range(value)):
                 place = "the time" if j == 0 else f"column {j + 1}, at t = {row[0]:g} s,"
-                raise ValueError(f"holds {value:g} as {place} in data row {len(rows) + 1}; give {bounds}")
+                raise ValueError(f"has {value:g} as {place} in data row {len(rows) + 1}; give {bounds}")
         rows.append(row)
     return rows
 

@@ -146,7 +146,7 @@ def _check_memory(plant: HeldPlant, task: Task, steps: int) -> None:
     needed, free = COPIES * 8.0 * rows * plant.n_s * float(steps) ** 2, free_memory()
     if needed > free:
         raise ResourceError(
-            f"a plan of {steps:.6g} intervals would take about {size_text(needed)} of memory, and {size_text(free)} is "
+            f"a plan of {steps:.6g} intervals would need about {size_text(needed)} of memory, and {size_text(free)} is "
             "free; lower control.constraints.horizon or parts, or raise control.constraints.grid"
         )
 

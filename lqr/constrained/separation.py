@@ -1,4 +1,4 @@
-"""How far a body stands off a convex obstacle, and the half-space between them.
+"""Distance of a body from a convex obstacle, and the half-space between them.
 
 The gap of the convex hulls is max over unit n of min_j n.y_j - h(n), h the support of the obstacle; it is attained at
 the normal of a side of either, or along the line between two corners. Where they overlap it is minus the shortest way

@@ -38,7 +38,7 @@ def body_surface(model: Model) -> Surface:
         if isinstance(entry, str) and distance[number] > SAME * layout.extent:
             raise ControlError(f"{key} is a node inside the body; give an output on its boundary, or a point in metres")
         if number in kept:
-            raise ControlError(f"{key} takes the node {(nodes[number] + 0.0).tolist()} a second time; leave it out")
+            raise ControlError(f"{key} names the node {(nodes[number] + 0.0).tolist()} a second time; leave it out")
         kept.append(number)
     return replace(surface, kept=np.sort(np.array(kept, dtype=np.int64)))
 

@@ -64,10 +64,10 @@ def require_observable(model: Model) -> None:
     if layout.n_e > DENSE_LIMIT:
         raise ControlError(
             f"an observer is checked with all modes of the plant, at most {DENSE_LIMIT}; this scene has {layout.n_e}: "
-            "take a coarser mesh"
+            "use a coarser mesh"
         )
     if control.method == "modal":
-        raise ControlError("an observer takes the optimal gain of the whole plant; leave out control.method = 'modal'")
+        raise ControlError("an observer needs the optimal gain of the whole plant; leave out control.method = 'modal'")
     if control.loop.delay:
         raise ControlError("control.loop.delay and an observer exclude each other; give control.observer.delay instead")
 

@@ -127,7 +127,7 @@ class Controller(Shown):
         if self.observer is not None and self.observer.B.shape != (N, n_s):
             raise ControlError(f"the observer has {len(self.observer.A)} states, the plant of the controller {N}")
         if self.planner is not None and self.planner.T.shape[1] != N:
-            raise ControlError(f"the plan takes {self.planner.T.shape[1]} states, the plant of the controller has {N}")
+            raise ControlError(f"the plan has {self.planner.T.shape[1]} states, the plant of the controller has {N}")
         self.model = _tissue_step(self.plant, self.period)
         self.reset()
 
@@ -170,7 +170,7 @@ class Controller(Shown):
         if self.observer is not None:
             return self._observed(q_s, v_s, y)
         if y is not None:
-            raise ControlError("this controller has no observer that takes y; leave it out, or give the scene one")
+            raise ControlError("this controller has no observer that uses y; leave it out, or give the scene one")
         if not hypot(*q_s, *v_s) < ABSURD:
             return self._again()
         n_s, x = self.n_s, self._x

@@ -66,7 +66,7 @@ class Estimate:
         own = self.filter
         self.samples.append(np.concatenate([q_s, v_s]) if own.speed else np.array(q_s, dtype=float))
         if y is not None and np.shape(y) != (own.others,):
-            raise ControlError(f"y has the shape {np.shape(y)}; this controller takes {own.others} samples beside q_s")
+            raise ControlError(f"y has the shape {np.shape(y)}; this controller needs {own.others} samples beside q_s")
         if len(self.samples) <= own.delay:  # nothing has arrived
             return self._ahead(self.m)
         sample = np.concatenate([self.samples[0], np.full(own.others, np.nan) if y is None else y])

@@ -78,7 +78,7 @@ class LoopTrajectory(Shown, FullOrderRun):
     energy: Array
     """Energy of the tissue relative to the hand at each time, as of a forward run [J], (steps + 1,)."""
     dissipated: Array
-    """Energy that damping has taken up to each time [J], (steps + 1,)."""
+    """Energy dissipated by damping up to each time [J], (steps + 1,)."""
     cost: Array
     """Cost J up to each grid point, (steps + 1,)."""
     final: PlantState

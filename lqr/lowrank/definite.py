@@ -19,7 +19,7 @@ from softgrasp.lqr.plant.operators import least_beta
 RESPONSE_RTOL = 1e-8
 # Damping ratio of the lowest mode left out from which real shifts serve: below, poles lie near the imaginary axis and
 # responses at real shifts no longer resolve them. At 0.11 real shifts take as many solves as complex ones, at 0.01 the
-# gain stays 1e-5 off however many there are.
+# error of the gain stays 1e-5 however many there are.
 DAMPED = 0.1
 
 

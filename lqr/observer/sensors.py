@@ -79,7 +79,7 @@ def make_sensors(problem: RiccatiProblem, markers: list[list[float]], noise: Noi
     for i, point in enumerate(markers):
         rigid, column, where = _marker(problem, np.asarray(point, dtype=float), i)
         if where in taken:
-            raise ControlError(f"control.observer.markers[{i}] = {point} takes the node {list(where)} a second time")
+            raise ControlError(f"control.observer.markers[{i}] = {point} names the node {list(where)} a second time")
         taken.append(where)
         hands, z, v = [*hands, np.vstack([rigid.T, np.zeros((n_s, d))])], [*z, column], [*v, np.zeros((n, d))]
         names, sd = [*names, *(f"marker{i + 1}_{axis}" for axis in AXES[:d])], [*sd, *[noise.marker] * d]
@@ -119,7 +119,7 @@ def make_disturbance(problem: RiccatiProblem, hand: float, load: float, box: lis
         load: along every axis [N per sqrt(Hz)].
         box: [[lo], [hi]] [m]; None: the whole tissue.
 
-    Raises ControlError: the box holds no free node.
+    Raises ControlError: the box contains no free node.
     """
     layout = problem.layout
     n_s, d = layout.n_s, layout.dimension
@@ -130,7 +130,7 @@ def make_disturbance(problem: RiccatiProblem, hand: float, load: float, box: lis
         inside = ((layout.nodes >= low - slack) & (layout.nodes <= high + slack)).all(axis=1)
     count = int(total(layout.comm, np.array([float(inside.sum())]))[0])
     if count == 0:
-        raise ControlError(f"control.observer.disturbance.box = {box} holds no free node of the body; enlarge it")
+        raise ControlError(f"control.observer.disturbance.box = {box} contains no free node of the body; enlarge it")
     p = np.zeros((layout.n_local, d))
     for axis in range(d):
         p[axis::d, axis] = inside / count

@@ -41,7 +41,7 @@ class Replanned:
     outcome: Outcome
     """Which plan it follows."""
     reason: str
-    """Why no plan from the estimate was taken; empty where one was."""
+    """Why no plan from the estimate was adopted; empty where one was."""
     depth: float
     """How far inside clearance and margin the plan goes [m]."""
     steps: int

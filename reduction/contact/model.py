@@ -113,7 +113,7 @@ class ContactModel(Shown):
     origin: dict[str, Any] = field(default_factory=dict)
     """Keys of the scene that decide on a run, see `reduction.origin`; {} for none."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """Time that the parts took to make [s]."""
+    """Time for making the parts [s]."""
     layout: BlockLayout | None = None
     """Of the unknowns of z on the ranks; None when loaded without a mesh."""
     V: Array | None = None

@@ -113,5 +113,5 @@ class ContactSteps:
 def _unsolved(n: int, dt: float) -> SolverError:
     return SolverError(
         f"the contact problem of the step from t = {n * dt:.6g} s has no solution; obstacles that leave the tissue no "
-        "room are the usual reason: move one, or take smaller steps"
+        "room are the usual reason: move one, or use smaller steps"
     )

@@ -120,7 +120,7 @@ def _compiled(texts: dict[str, str], sources: tuple[str, ...]) -> bytes:
     """The shared library of these sources. Raises ModelError: there is no compiler, or it refuses them."""
     compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
-        raise ModelError("an FMU holds a binary, and there is no C compiler here; install one, or name it in CC")
+        raise ModelError("an FMU contains a binary, and there is no C compiler here; install one, or name it in CC")
     with tempfile.TemporaryDirectory() as folder:
         for name, text in texts.items():
             (Path(folder) / name).write_text(text)

@@ -20,7 +20,7 @@ from softgrasp.reduction.identify.unknowns import Unknown
 from softgrasp.reduction.online import ReducedTrajectory
 
 ROUNDS = 15
-MOVED, MOVED_NOISE = 0.05, 0.5  # change of log theta, or share of its noise, within which a basis stands
+MOVED, MOVED_NOISE = 0.05, 0.5  # change of log theta, or share of its noise, within which a basis is kept
 LATE = 0.1  # of the run: largest time shift between hand and camera
 EDGE = 1e-6  # of log theta: nearer to the end of a range a value lies on it
 NO_RUN = 1e6  # residual of values at which a small model folds, which sends the fit back

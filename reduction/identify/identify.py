@@ -271,7 +271,9 @@ def _within_range(answer: Identified, solved: Solved, first: Array, asked: Asked
     if not scale.left:
         return answer
     if asked.law == "linear" or beyond.not_yet(answer):
-        hint = "identify tests finite strain once the answer stands" if asked.law == "auto" else "--law auto tests it"
+        hint = (
+            "identify tests finite strain once the answer is accepted" if asked.law == "auto" else "--law auto tests it"
+        )
         return replace(answer, warnings=(*answer.warnings, scale.sentence(hint)))
     try:
         part = beyond.strain_part(fit.misfit, solved.line, fit.p, solved.errors, unknowns, beyond.DEFAULT)
@@ -333,7 +335,7 @@ def _cures(
     """What mends each part that exceeds the noise; ``N`` of the reduced models, None of a certified one."""
     mesh, step = parts["mesh"], parts["time step"]
     certified = "reduce the scene with a smaller --tolerance, or leave the certified model out"
-    result = {"reduction": certified if N is None else f"take more than N = {N} columns"}
+    result = {"reduction": certified if N is None else f"use more than N = {N} columns"}
     if mesh is not None and estimate is not None:
         tolerance = finer_tolerance(mesh, noise, estimate)
         result["mesh"] = f"set tissue.order = 2 and tissue.refine.tolerance = {tolerance:g}, or use --refine"

@@ -52,9 +52,9 @@ class Identified(Shown):
     residuals: Residuals
     """Size and whiteness of the residuals."""
     reasons: tuple[str, ...]
-    """Why the answer is refused, a sentence each; empty where it stands."""
+    """Why the answer is refused, a sentence each; empty where it is accepted."""
     warnings: tuple[str, ...]
-    """What a reader should know although it stands, a sentence each."""
+    """What a reader should know although it is accepted, a sentence each."""
     history: tuple[tuple[float, ...], ...]
     """Values at the start and after each round, (k,) each."""
     runs: int
@@ -104,7 +104,7 @@ class Identified(Shown):
     def card(self) -> Card:
         """Values with their errors, misfit and verdict."""
         r = self.residuals
-        verdict = f"refused: {self.reasons[0]}" if self.reasons else "stands"
+        verdict = f"refused: {self.reasons[0]}" if self.reasons else "accepted"
         return Card(
             f"Identified {self.scene.name}",
             (*self.rows(), ("misfit", f"{r.misfit:.3g} sigma, by chance at most {r.limit:.3g}"), ("answer", verdict)),

@@ -61,7 +61,7 @@ def check_strained(model: Model, names: Sequence[Unknown], experiments: Sequence
     name = model.scene.name
     if any(not e.driven for e in experiments):
         raise SceneError(
-            f"scene '{name}': at finite strain identify needs the motion of the hand, and a force moves it; take "
+            f"scene '{name}': at finite strain identify needs the motion of the hand, and a force moves it; set "
             "motion.drive = 'motion' or measure the hand as q_x"
         )
     if any(u.kind == "rho" for u in names):

@@ -134,7 +134,7 @@ def suggest_markers(
     if model.scene.effects.finite_strain is not None:
         raise SceneError(
             f"scene '{model.scene.name}': markers are chosen by linear elasticity, and effects.finite_strain is on; "
-            "take --set effects.finite_strain=false"
+            "use --set effects.finite_strain=false"
         )
     names = [part.strip() for part in fit.split(",") if part.strip()] if isinstance(fit, str) else list(fit)
     unknowns = parse_unknowns(names, model)

@@ -38,7 +38,7 @@ class Unknown:
 def parse_unknowns(names: Sequence[str], model: Model) -> tuple[Unknown, ...]:
     """Unknowns of ("mu", "lambda", "skin.mu"); without a layer the tissue that no layer claims.
 
-    Raises SceneError: a name is none, stands twice, or the scene has no such part or no positive value to start from.
+    Raises SceneError: a name is none, is given twice, or the scene has no such part or no positive value to start from.
     """
     found = []
     scene, inside = model.scene, [blocks.name for blocks in model.system.layers]

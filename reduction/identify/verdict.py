@@ -131,7 +131,7 @@ def reasons(
 
 
 def warnings(residuals: Residuals, robust: bool) -> tuple[str, ...]:
-    """What a reader should know although the answer stands, a sentence each."""
+    """What a reader should know although the answer is accepted, a sentence each."""
     found = []
     if residuals.misfit < 2 - residuals.limit:
         found.append(

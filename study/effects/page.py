@@ -31,7 +31,7 @@ HOW = (
     ("optional", "the effect changes the outputs by less, but it costs nothing or the control problem needs it"),
     ("wasted", "the effect costs work or memory and changes no output"),
     ("noise", "paired samples disagree, or differ by less than two steps of the same scene do"),
-    ("costs", "counted operations and held memory decide; times are shown with their noise"),
+    ("costs", "counted operations and allocated memory decide; times are shown with their noise"),
     ("factor", "the time to factor S and to solve for the hand's equation before the first step"),
 )
 PROOFS = {

@@ -148,7 +148,7 @@ def check_variants(scene: Scene, comm: MPI.Intracomm, explanation: Explanation, 
     if needed > 0.8 * free:
         raise ResourceError(
             f"effects: {variants} variants of the scene need about {size_text(needed)} at once, where "
-            f"{size_text(0.8 * free)} may be taken; judge the effects on a coarser mesh, e.g. --set tissue.cells, "
+            f"{size_text(0.8 * free)} are available; judge the effects on a coarser mesh, e.g. --set tissue.cells, "
             "or allow more with --set output.memory=GIB"
         )
 

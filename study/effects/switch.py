@@ -97,7 +97,7 @@ def _obstacle(scene: Scene, name: str, scales: Scales) -> str:
     if name == "rotation" and on and scene.effects.frame is not None:
         return "effects.frame needs it"
     if name == "rotation" and scene.motion.profile == "csv":
-        return "the columns of motion.csv hold the angles" if on else "motion.csv has no columns for angles"
+        return "the columns of motion.csv are the angles" if on else "motion.csv has no columns for angles"
     return ""
 
 

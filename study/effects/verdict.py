@@ -76,7 +76,9 @@ def _advice(s: Switch, verdict: str, change: float, why: str, cost: Cost, tolera
         text = "Keep it: it changes" if s.on else "Switch it on if it acts on your robot: it would change"
         text += f" the outputs by {percent(change)}, tolerance {percent(tolerance)}"
         if s.strength is not None and change < 0.1:  # where the change still grows with the strength
-            text += f"; below about {s.strength * tolerance / change:.2g} {s.unit} it would not show"
+            text += (
+                f"; below about {s.strength * tolerance / change:.2g} {s.unit} its change would be below the tolerance"
+            )
         return text + "."
     little = _change_in_words(change)
     if why:

@@ -82,7 +82,7 @@ def small_obstacles(model: Model) -> list[str]:
     between, what = longest / max(divided, layout.order), "nodes" if divided == 1 else "points"
     return [
         f"Obstacle '{o.name}' is {size:.2g} m {'in radius' if o.kind in ('disc', 'ball') else 'thick'}, less than the "
-        f"{between:.2g} m between boundary {what}: only {what} touch, so it can sink in between two; take "
+        f"{between:.2g} m between boundary {what}: only {what} touch, so it can sink in between two; use "
         + ("smaller cells." if entry.friction else "smaller cells, or more obstacle.parts.")
         for o, entry in zip(make_obstacles(model.scene, layout.dimension), entries, strict=True)
         if (size := o.shape.size()) < between * (1 - 1e-9)  # edges of equal cells differ by rounding
@@ -164,7 +164,7 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     texts = [*locking(poisson, scene.tissue.order), *small_obstacles(model)]
     omega = slowest(system, Z)
     if omega > 0:
-        period = f"the slowest period that the tissue shows ({2 * np.pi / omega:.3g} s)"
+        period = f"the slowest period of the tissue in this run ({2 * np.pi / omega:.3g} s)"
         texts += coarse(omega, float(run.times[1]), float(run.times[-1]), period)
     sizes = total(system.layout.comm, np.einsum("ij,ij->j", Z, Z))
     z, t = Z[:, int(np.argmax(sizes))], times[int(np.argmax(sizes))]

@@ -105,7 +105,7 @@ class EndReport:
 
 
 @dataclass(frozen=True)
-class MeshReport:
+class MeshSummary:
     """What is known of the mesh's error before a run."""
 
     ends: tuple[EndReport, ...]  # singular ends by kind and exponent, the strongest first
@@ -139,7 +139,7 @@ class Explanation:
     forecasts: tuple[Forecast, ...]  # modelled cost of the run by the number of ranks; none at finite strain
     snapshot_columns: int  # number of states that the run stores in memory
     snapshot_bytes: int  # memory of these states over all ranks [byte]
-    mesh: MeshReport  # singular ends, and the error they leave
+    mesh: MeshSummary  # singular ends, and the error they leave
     coarser: int  # unknowns of the coarser copy of a large mesh that gives modes, sag and estimate [1]; 0: none
     built: bool  # whether the mesh itself was; else its sizes are computed: unknowns to 1 %, entries to 10 %
     dimension: int  # 2 or 3
@@ -311,7 +311,7 @@ def on_fewer_cells(scene: Scene, comm: MPI.Intracomm) -> Model | None:
         return None
 
 
-def mesh_report(looked: Model, n_e: int, model: Model | None) -> MeshReport:
+def mesh_report(looked: Model, n_e: int, model: Model | None) -> MeshSummary:
     """Look for singular ends and estimate the error, that of a coarser copy where the mesh takes long. Collective."""
     known = looked if model is None else model
     scene, tissue = known.scene, known.space.mesh
@@ -340,7 +340,7 @@ def mesh_report(looked: Model, n_e: int, model: Model | None) -> MeshReport:
         )
     )
     first = refine is not None and refine.tolerance is not None and refine.passes > 0
-    return MeshReport(kinds, order, graded, first, coarse, *values)
+    return MeshSummary(kinds, order, graded, first, coarse, *values)
 
 
 def _warnings(

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from softgrasp.fem import SMALL_SHARE, SMALL_STRAIN, Forecast, size_text
 from softgrasp.fem.run.forecast import RELIABLE, START
-from softgrasp.study.forward.explain import EffectReport, Explanation, MeshReport, explain
+from softgrasp.study.forward.explain import EffectReport, Explanation, MeshSummary, explain
 from softgrasp.study.report import EQUATION, Page, Section, in_words, percent
 from softgrasp.study.report.origin import origin
 from softgrasp.study.shell import Session, folder_lock
@@ -132,7 +132,7 @@ def sag_rows(result: Explanation) -> list[tuple[str, str]]:
     ]  # fmt: skip
 
 
-def mesh_lines(report: MeshReport, dimension: int, in_frame: bool = False) -> list[str]:
+def mesh_lines(report: MeshSummary, dimension: int, in_frame: bool = False) -> list[str]:
     """The report in sentences."""
     place = "point" if dimension == 2 else "edge"
     lines = [

@@ -16,7 +16,7 @@ from softgrasp.study.shell.session import Page
 
 CAPTIONS = {
     "fit.png": "Above: measured outputs (dots) and the fit (lines), of each experiment. Below: residuals over the "
-    "stated standard deviation of the noise; the grey band holds 95 % of white noise.",
+    "stated standard deviation of the noise; the grey band contains 95 % of white noise.",
     "ellipses.png": "Pairs of values: change against the answer. Ellipses: 68 and 95 % of the noise. Lines to a dot: "
     "the answer without one of the other parts of its error; no dot: it lies outside.",
     "history.png": "Values after each round over the final ones; a round is a fit with one reduced model.",
@@ -169,7 +169,7 @@ def summary(answer: Identified) -> list[str]:
     if rests:
         sentences.append(f"The values and their errors hold for {in_words(rests)} as in the scene.")
     if not answer.reasons:
-        sentences.append("fitted.toml is the scene with these values; simulate, reduce and control take it.")
+        sentences.append("fitted.toml is the scene with these values; simulate, reduce and control accept it.")
     return sentences
 
 

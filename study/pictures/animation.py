@@ -56,8 +56,8 @@ def move_bytes(
     """
     kept, durations = timing(times)
     frames, times = frames[kept].astype(np.float64), times[kept]
-    shot = body.make_shot(picture, frames, times, table, target, None if tractions is None else tractions[kept])
-    return gif_bytes(render(shot, frames, times), durations)
+    move = body.make_view(picture, frames, times, table, target, None if tractions is None else tractions[kept])
+    return gif_bytes(render(move, frames, times), durations)
 
 
 def timing(times: Array) -> tuple[list[int], list[int]]:
@@ -73,24 +73,24 @@ def timing(times: Array) -> tuple[list[int], list[int]]:
     return kept, [*(10 * max(int(at[j] - at[i]), TICKS) for i, j in pairwise(kept)), int(1000 * REST)]
 
 
-def render(shot: body.Shot, frames: Array, times: Array) -> list[Any]:
+def render(move: body.MoveView, frames: Array, times: Array) -> list[Any]:
     """One picture per frame, all of one size."""
-    frame = followed(shot, frames)
+    frame = followed(move, frames)
     if frame:
-        shot = replace(shot, low=frame[0][0], high=frame[0][1])
+        move = replace(move, low=frame[0][0], high=frame[0][1])
     fast = speed_up(times)
     digits = int(np.clip(2 - np.floor(np.log10(times[-1] or 1.0)), 0, 6))
     note = f" ({fast:g}×)" if fast != 1 else ""
     with paper_style():
-        figure, axes = body.make_axes(shot, 1, captions=False, width=5.4, tallest=4.2)
+        figure, axes = body.make_axes(move, 1, captions=False, width=5.4, tallest=4.2)
 
         # The longest text first, so that all frames have the size of the first.
         def caption(k: int) -> str:
-            return f"t = {times[k]:.{digits}f} s{note}" + (body.place(shot.hands[k]) if frame else "")
+            return f"t = {times[k]:.{digits}f} s{note}" + (body.place(move.hands[k]) if frame else "")
 
         stamp = axes[0].set_title(max(map(caption, range(len(times))), key=len), pad=3)
-        body.colour_bar(figure, axes, shot)
-        body.legend(figure, shot)
+        body.colour_bar(figure, axes, move)
+        body.legend(figure, move)
         body.settle(figure)
         window = np.array([axes[0].get_xlim(), axes[0].get_ylim()]).T
 
@@ -98,21 +98,21 @@ def render(shot: body.Shot, frames: Array, times: Array) -> list[Any]:
             if frame:
                 low, high = window + frame[k][0] - frame[0][0]
                 axes[0].set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-            body.draw_surroundings(axes[0], shot, [k])
-            body.draw_scene(axes[0], shot, frames[k : k + 1], None, shot.hands[k : k + 1])
-            body.name_layers(axes[0], shot, frames[k], inside=True)  # beside the body they would change sides
+            body.draw_surroundings(axes[0], move, [k])
+            body.draw_scene(axes[0], move, frames[k : k + 1], None, move.hands[k : k + 1])
+            body.name_layers(axes[0], move, frames[k], inside=True)  # beside the body they would change sides
             stamp.set_text(caption(k))
 
         return film(figure, axes, draw, range(len(times)), [stamp])
 
 
-def followed(shot: body.Shot, frames: Array) -> list[tuple[Array, Array]]:
+def followed(move: body.MoveView, frames: Array) -> list[tuple[Array, Array]]:
     """Corners of a frame that goes with the body in 3D, where the whole way would make it small; else none."""
-    if shot.picture.dimension == 2:
+    if move.picture.dimension == 2:
         return []
-    around = around_bodies(shot.picture, frames, shot.hands)
+    around = around_bodies(move.picture, frames, move.hands)
     low, high = around[0]
-    return around if ((high - low) / (shot.high - shot.low)).max() < SMALL else []
+    return around if ((high - low) / (move.high - move.low)).max() < SMALL else []
 
 
 def film(

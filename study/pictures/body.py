@@ -23,7 +23,7 @@ from matplotlib.tri import Triangulation
 from softgrasp.fem import Array, PictureMesh
 from softgrasp.study.pictures import shapes, style
 from softgrasp.study.pictures.plate import around_bodies, hand_plate, held_facets
-from softgrasp.study.pictures.shapes import Shot
+from softgrasp.study.pictures.shapes import MoveView
 from softgrasp.study.pictures.style import colour_map, length_unit, paper_style, pressure_unit, save
 
 MANY_CELLS = 300_000  # above, a picture shows the outline only
@@ -34,14 +34,14 @@ DOTS: Any = (0, (1, 1.2))
 DASHES: Any = (0, (5, 3))
 
 
-def make_shot(
+def make_view(
     picture: PictureMesh,
     states: Array,
     times: Array,
     table: Array,
     target: npt.ArrayLike | None,
     tractions: Array | None = None,
-) -> Shot:
+) -> MoveView:
     """Prepare the views of a move; see `figure_move` for the arguments."""
     hands, given = shapes.hands_at(table, times), np.asarray([] if target is None else target, dtype=np.float64)
     aim = None if target is None else np.pad(given, (0, picture.n_s - len(given)))
@@ -66,7 +66,7 @@ def make_shot(
     pressure = 0.0 if tractions is None else float(np.linalg.norm(tractions, axis=2).max())
     lines = [] if aim is None else outline(picture, picture.points + picture.rigid(aim))
     edges = [picture.facets, shapes.interfaces(picture)] if picture.dimension == 2 else [np.zeros((0, 2), dtype=int)]
-    return Shot(
+    return MoveView(
         picture, states, times, hands, tractions if pressure > 0 else None, pressure, room, path, norm, unit, low, high,
         polygons, np.vstack(edges), lines,
     )  # fmt: skip
@@ -96,53 +96,53 @@ def figure_move(
     """
     chosen = shapes.pick_instants(picture, states, times, table)
     states, times = states[chosen].astype(np.float64), times[chosen]
-    shot = make_shot(picture, states, times, table, target, None if tractions is None else tractions[chosen])
+    move = make_view(picture, states, times, table, target, None if tractions is None else tractions[chosen])
     with paper_style():
         meet = picture.dimension == 3 or shapes.overlap(picture, states)  # in 3D captions meet bodies
         apart = len(states) > 1 and meet
         solid = apart and picture.dimension == 3
-        frames = around_bodies(picture, states, shot.hands) if solid else []
+        frames = around_bodies(picture, states, move.hands) if solid else []
         if solid:  # each body fills its panel; its place is in the title
-            shot = replace(shot, low=frames[0][0], high=frames[0][1])
+            move = replace(move, low=frames[0][0], high=frames[0][1])
         groups = [[i] for i in range(len(states))] if apart else [list(range(len(states)))]
-        figure, axes = make_axes(shot, len(groups), captions=True)
+        figure, axes = make_axes(move, len(groups), captions=True)
         for ax, group in zip(axes, groups if apart else (), strict=False):
-            ax.set_title(_time(times[group[0]]) + (place(shot.hands[group[0]]) if solid else ""), pad=3)
-        colour_bar(figure, axes, shot)
-        legend(figure, shot)
+            ax.set_title(_time(times[group[0]]) + (place(move.hands[group[0]]) if solid else ""), pad=3)
+        colour_bar(figure, axes, move)
+        legend(figure, move)
         settle(figure)
         for ax, (low, high) in zip(axes, frames, strict=False):
             ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         for ax, group in zip(axes, groups, strict=True):
-            draw_surroundings(ax, shot, group)
-            draw_scene(ax, shot, states[group], None if apart else times[group], shot.hands[group])
-        name_layers(axes[-1], shot, states[-1])
+            draw_surroundings(ax, move, group)
+            draw_scene(ax, move, states[group], None if apart else times[group], move.hands[group])
+        name_layers(axes[-1], move, states[-1])
         return save(figure, out_png)
 
 
-def draw_surroundings(ax: Any, shot: Shot, numbers: list[int]) -> None:
+def draw_surroundings(ax: Any, move: MoveView, numbers: list[int]) -> None:
     """Obstacles at the instants with these numbers, and the pressure of contact on the bodies."""
-    if shot.picture.obstacles:
+    if move.picture.obstacles:
         from softgrasp.study.pictures.obstacles import draw_surroundings as draw  # few scenes have any
 
-        draw(ax, shot, numbers)
+        draw(ax, move, numbers)
 
 
-def draw_scene(ax: Any, shot: Shot, states: Array, times: Array | None, hands: Array) -> None:
+def draw_scene(ax: Any, move: MoveView, states: Array, times: Array | None, hands: Array) -> None:
     """Bodies, hand and, if given, the times beside the bodies on axes from `make_axes`."""
-    picture = shot.picture
+    picture = move.picture
     for i, (u, q) in enumerate(zip(states, hands, strict=True)):
         if picture.dimension == 2:
-            _draw_2d(ax, shot, u, q)
+            _draw_2d(ax, move, u, q)
         else:
-            _draw_3d(ax, shot, u, q)
+            _draw_3d(ax, move, u, q)
         if times is not None:
-            whole = np.vstack([picture.points + u, *shapes.moved(picture, shot.hand, q)])
-            _caption(ax, shot, _box(shapes.seen(whole)), _time(times[i]))
+            whole = np.vstack([picture.points + u, *shapes.moved(picture, move.hand, q)])
+            _caption(ax, move, _box(shapes.seen(whole)), _time(times[i]))
 
 
 def make_axes(
-    shot: Shot, panels: int, *, captions: bool, width: float | None = None, tallest: float | None = None
+    move: MoveView, panels: int, *, captions: bool, width: float | None = None, tallest: float | None = None
 ) -> tuple[Any, list[Any]]:
     """Figure and axes of the right shape for the scene, with path and target; call within `paper_style`.
 
@@ -150,15 +150,15 @@ def make_axes(
     above each of several. ``width`` is that of the figure, ``tallest`` the height of all panels together [inch].
     Matplotlib places the axes, at the latest in :func:`settle`.
     """
-    solid, many = shot.picture.dimension == 3, panels > 1
-    span = np.maximum(shot.high - shot.low, 1e-3 * float((shot.high - shot.low).max()))
+    solid, many = move.picture.dimension == 3, panels > 1
+    span = np.maximum(move.high - move.low, 1e-3 * float((move.high - move.low).max()))
     flat = span[0] > 2.2 * span[1]
     width = width or (style.WIDTH if many or flat else style.COLUMN)
     tallest = tallest or (3.9 if many else 2.8)
     beside = np.array([0.8, 0.1]) if solid else np.array([1.3, 0.5])  # labels and colour bar
     pads = np.array([[PAD, PAD], [PAD, PAD]])  # [[left, bottom], [right, top]]
     if captions and not many:
-        pads += np.array([[0.0, 0.0], [CAPTION, 0.0]]) if _upright(shot) else np.array([[PAD, LINE], [PAD, 0.0]])
+        pads += np.array([[0.0, 0.0], [CAPTION, 0.0]]) if _upright(move) else np.array([[PAD, LINE], [PAD, 0.0]])
 
     def scale_of(shape: tuple[int, int]) -> float:
         """Inches per metre with that many rows and columns."""
@@ -167,7 +167,7 @@ def make_axes(
 
     rows, columns = max(((r, -(-panels // r)) for r in range(1, panels + 1) if panels % r == 0), key=scale_of)
     scale = scale_of((rows, columns))
-    low, high = shot.low - pads[0] / scale, shot.high + pads[1] / scale
+    low, high = move.low - pads[0] / scale, move.high + pads[1] / scale
     w, h = (high - low) * scale
     size = beside[0] + columns * (w + GAP), beside[1] + rows * (h + GAP + LINE)
     figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, sharex=not solid, sharey=not solid)
@@ -175,8 +175,8 @@ def make_axes(
     axes = list(grid.flat)
     for ax in axes:
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        ax.plot(*shapes.seen(shot.path).T, ls=DASHES, color=style.OUTLINE, lw=0.9, zorder=1)
-        for line in shot.aim:
+        ax.plot(*shapes.seen(move.path).T, ls=DASHES, color=style.OUTLINE, lw=0.9, zorder=1)
+        for line in move.aim:
             ax.plot(*line.T, ls=DOTS, color=style.TARGET, lw=1.3, zorder=5)
         if solid:
             ax.set_axis_off()
@@ -185,7 +185,7 @@ def make_axes(
         ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(h / 0.4, 2, 6)), steps=style.STEPS))
         ax.label_outer()
     if solid:
-        _tripod(axes[0], shot)
+        _tripod(axes[0], move)
     else:
         for ax in grid[-1]:
             ax.set_xlabel("x [m]")
@@ -200,37 +200,37 @@ def settle(figure: Any) -> None:
     figure.set_layout_engine("none")
 
 
-def colour_bar(figure: Any, axes: list[Any], shot: Shot) -> None:
+def colour_bar(figure: Any, axes: list[Any], move: MoveView) -> None:
     """Colour bar of the relative displacement; none for outlines and where nothing deforms."""
-    if len(shot.picture.cells) > MANY_CELLS or not shot.norm.vmax > 0:
+    if len(move.picture.cells) > MANY_CELLS or not move.norm.vmax > 0:
         return
     height = 0.8 * figure.get_figheight()  # of the axes, about
     shrink = min(1.0, 2.4 / height)
     words = "displacement relative to the hand" if shrink * height > 2.2 else "displacement relative\nto the hand"
     words = words if height > 1.2 else "displacement\nrelative to\nthe hand"
     bar = figure.colorbar(
-        mpl.cm.ScalarMappable(shot.norm, colour_map()), ax=axes, label=f"{words} [{shot.unit[1]}]", shrink=shrink,
+        mpl.cm.ScalarMappable(move.norm, colour_map()), ax=axes, label=f"{words} [{move.unit[1]}]", shrink=shrink,
         aspect=18 * shrink * height / 2.4, pad=0.02,
     )  # fmt: skip
     bar.outline.set_linewidth(0.5)
     bar.ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(shrink * height / 0.35, 2, 6)), steps=style.STEPS))
 
 
-def legend(figure: Any, shot: Shot) -> None:
+def legend(figure: Any, move: MoveView) -> None:
     """One row above the axes, where nothing is hidden."""
     entries: list[Any] = []
-    filled = len(shot.picture.cells) <= MANY_CELLS
-    if shot.hand or filled:
+    filled = len(move.picture.cells) <= MANY_CELLS
+    if move.hand or filled:
         entries.append(Patch(color=style.HAND, label="hand"))
-    if filled and not shot.norm.vmax > 0:
+    if filled and not move.norm.vmax > 0:
         entries.append(Patch(color=colour_map()(0.0), label="tissue, not deformed"))
-    if np.ptp(shot.path, axis=0).max() > 0:
+    if np.ptp(move.path, axis=0).max() > 0:
         entries.append(Line2D([], [], ls=DASHES, color=style.OUTLINE, lw=0.9, label="path of the hand"))
-    if shot.tractions is not None and shot.picture.dimension == 2:
-        factor, unit = pressure_unit(shot.pressure)
-        label = f"pressure, at most {factor * shot.pressure:.3g} {unit}"
+    if move.tractions is not None and move.picture.dimension == 2:
+        factor, unit = pressure_unit(move.pressure)
+        label = f"pressure, at most {factor * move.pressure:.3g} {unit}"
         entries.append(Line2D([], [], ls="", marker=r"$\rightarrow$", ms=9, color=style.HAND, label=label))
-    if shot.aim:
+    if move.aim:
         entries.append(Line2D([], [], ls=DOTS, color=style.TARGET, lw=1.3, label="target"))
     figure.legend(handles=entries, loc="outside upper center", ncols=4, columnspacing=1.2, handlelength=1.8)
 
@@ -246,21 +246,21 @@ def place(q: Array) -> str:
     return f"\nat ({', '.join(f'{v:.2g}' for v in np.where(near, 0.0, x))}) m"
 
 
-def _upright(shot: Shot) -> bool:
+def _upright(move: MoveView) -> bool:
     """Whether the hand goes more up or down than sideways in the picture."""
-    along, up = np.ptp(shapes.seen(shot.path), axis=0)
+    along, up = np.ptp(shapes.seen(move.path), axis=0)
     return bool(up > along)
 
 
-def _caption(ax: Any, shot: Shot, box: Array, text: str) -> None:
+def _caption(ax: Any, move: MoveView, box: Array, text: str) -> None:
     """A caption below the box of a body, or to its right if the bodies stand above each other."""
-    if _upright(shot):
+    if _upright(move):
         look: dict[str, Any] = {"xytext": (4, 0), "ha": "left", "va": "center"}
         ax.annotate(text, (box[1, 0], box[:, 1].mean()), textcoords="offset points", zorder=6, **look)
         return
     left, right = ax.get_xlim()
     half = CAPTION / 2 * (right - left) / (ax.get_position().width * ax.figure.get_figwidth())
-    middle, way = float(box[:, 0].mean()), shapes.seen(shot.path[-1] - shot.path[0])
+    middle, way = float(box[:, 0].mean()), shapes.seen(move.path[-1] - move.path[0])
     # The body next to it and lower lies to the left if the hand goes up to the right: keep off it.
     middle = max(middle, box[0, 0] + half) if way.prod() > 0 else middle
     middle = min(middle, box[1, 0] - half) if way.prod() < 0 else middle
@@ -269,26 +269,26 @@ def _caption(ax: Any, shot: Shot, box: Array, text: str) -> None:
     ax.annotate(text, (middle, box[0, 1]), textcoords="offset points", zorder=6, **look)
 
 
-def _free_corner(shot: Shot) -> str:
+def _free_corner(move: MoveView) -> str:
     """The left corner that the bodies leave free: "top", "bottom" or "" for none."""
-    way = shapes.seen(shot.path[-1] - shot.path[0])
-    if (np.abs(way) > shot.high - shot.low).any():  # the frame is that of one body of a longer way
+    way = shapes.seen(move.path[-1] - move.path[0])
+    if (np.abs(way) > move.high - move.low).any():  # the frame is that of one body of a longer way
         return ""
-    if abs(float(way[0])) < 0.5 * float((shot.high - shot.low)[0]):
+    if abs(float(way[0])) < 0.5 * float((move.high - move.low)[0]):
         return ""
     return "top" if way.prod() > 0 else "bottom"
 
 
-def _tripod(ax: Any, shot: Shot) -> None:
+def _tripod(ax: Any, move: MoveView) -> None:
     """The directions of a 3D scene, each arm of the same length in space, in a free left corner or beside the scene."""
-    length = 0.2 * float((shot.high - shot.low).max())  # [m], rounded down to 1, 2 or 5 times a power of ten
+    length = 0.2 * float((move.high - move.low).max())  # [m], rounded down to 1, 2 or 5 times a power of ten
     power = 10.0 ** np.floor(np.log10(length))
     length = power * max(m for m in (1, 2, 5) if m * power <= length * 1.001)
-    ends, corner = shapes.seen(length * np.eye(3)), _free_corner(shot)
+    ends, corner = shapes.seen(length * np.eye(3)), _free_corner(move)
     low, high = np.minimum(ends.min(axis=0), 0.0), np.maximum(ends.max(axis=0), 0.0)
-    foot = shot.low - low
-    foot[0] -= 0.0 if corner else high[0] - low[0] + 0.15 * (shot.high - shot.low)[0]
-    foot[1] = shot.high[1] - high[1] if corner == "top" else foot[1] + 0.5 * length
+    foot = move.low - low
+    foot[0] -= 0.0 if corner else high[0] - low[0] + 0.15 * (move.high - move.low)[0]
+    foot[1] = move.high[1] - high[1] if corner == "top" else foot[1] + 0.5 * length
     look: dict[str, Any] = {"annotation_clip": False, "ha": "center", "va": "center"}
     for name, end in zip("xyz", ends, strict=True):
         arm = {"arrowstyle": "-", "lw": 0.8, "shrinkA": 0, "shrinkB": 0}
@@ -298,9 +298,9 @@ def _tripod(ax: Any, shot: Shot) -> None:
     ax.annotate(text, foot + low, (0, -9), textcoords="offset points", va="top", annotation_clip=False)
 
 
-def name_layers(ax: Any, shot: Shot, u: Array, *, inside: bool = False) -> None:
+def name_layers(ax: Any, move: MoveView, u: Array, *, inside: bool = False) -> None:
     """Names of the layers in 2D beside the body on the side with more room; without room, or on request, in it."""
-    picture, x = shot.picture, shot.picture.points + u
+    picture, x = move.picture, move.picture.points + u
     if len(picture.names) == 1 or picture.dimension == 3:
         return
     (left, right), (low, high) = ax.get_xlim(), _box(x)
@@ -329,20 +329,20 @@ def outline(picture: PictureMesh, x: Array) -> list[Array]:
     return shapes.shadow(shapes.seen(x), picture.facets)
 
 
-def _draw_2d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
-    picture = shot.picture
+def _draw_2d(ax: Any, move: MoveView, u: Array, q: Array) -> None:
+    picture = move.picture
     x = picture.points + u
     if len(picture.cells) <= MANY_CELLS:
-        look: dict[str, Any] = {"cmap": colour_map(), "norm": shot.norm, "rasterized": True, "zorder": 2}
-        body = TriMesh(Triangulation(x[:, 0], x[:, 1], picture.cells), array=shot.values(u, q), **look)
+        look: dict[str, Any] = {"cmap": colour_map(), "norm": move.norm, "rasterized": True, "zorder": 2}
+        body = TriMesh(Triangulation(x[:, 0], x[:, 1], picture.cells), array=move.values(u, q), **look)
         ax.add_collection(body, autolim=False)
-    ax.add_collection(LineCollection(x[shot.edges], colors=style.OUTLINE, linewidths=0.5, zorder=3), autolim=False)
-    hand = PolyCollection(shapes.moved(picture, shot.hand, q), color=style.HAND, linewidths=0.3, zorder=4)
+    ax.add_collection(LineCollection(x[move.edges], colors=style.OUTLINE, linewidths=0.5, zorder=3), autolim=False)
+    hand = PolyCollection(shapes.moved(picture, move.hand, q), color=style.HAND, linewidths=0.3, zorder=4)
     ax.add_collection(hand, autolim=False)
 
 
-def _draw_3d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
-    picture = shot.picture
+def _draw_3d(ax: Any, move: MoveView, u: Array, q: Array) -> None:
+    picture = move.picture
     x = picture.points + u
     if len(picture.cells) > MANY_CELLS:
         lines = LineCollection(outline(picture, x), colors=style.OUTLINE, linewidths=0.6, zorder=3)
@@ -351,22 +351,22 @@ def _draw_3d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
     for z, plate in zip((1.5, 2.5), hand_plate(picture, q), strict=True):
         flat = [shapes.seen(polygon) for polygon in plate]
         ax.add_collection(PolyCollection(flat, color=style.HAND, linewidths=0.3, zorder=z), autolim=False)
-    faces, colours = _paint(shot, u, q)
+    faces, colours = _paint(move, u, q)
     look: dict[str, Any] = {"facecolors": colours, "edgecolors": colours, "linewidths": 0.5, "joinstyle": "round"}
     ax.add_collection(PolyCollection(list(shapes.seen(faces)), zorder=2, rasterized=True, **look), autolim=False)
 
 
-def _paint(shot: Shot, u: Array, q: Array) -> tuple[Array, Array]:
+def _paint(move: MoveView, u: Array, q: Array) -> tuple[Array, Array]:
     """Visible boundary of one instant from back to front, (m, 3, 3) [m], and its shaded colours (m, 3)."""
-    picture, view = shot.picture, shapes.view_direction()
+    picture, view = move.picture, shapes.view_direction()
     held = held_facets(picture)
     corners = (picture.points + u)[picture.facets]
     normals = shapes.facet_normals(corners)
     front = normals @ view > 0
     weights = shapes.subdivision(int(np.clip(np.sqrt(4000 / len(corners)), 1, 4)))
     faces = np.einsum("sck,fkd->fscd", weights, corners[front])
-    values = shot.values(u, q)[picture.facets[front]] @ weights.mean(axis=1).T
-    rgb = colour_map()(shot.norm(values))[..., :3]
+    values = move.values(u, q)[picture.facets[front]] @ weights.mean(axis=1).T
+    rgb = colour_map()(move.norm(values))[..., :3]
     turn = np.radians(shapes.AZIMUTH - 35.0)
     light = np.array([0.6 * np.cos(turn), 0.6 * np.sin(turn), 0.8])
     lit = np.clip(normals[front] @ light, 0.0, 1.0)[:, None, None]

@@ -11,7 +11,7 @@ from softgrasp.fem import Array, Model, Run, SeriesWriter, Trajectory, frame_ste
 from softgrasp.fem.checksums import AGAIN, read_arrays, write_arrays
 from softgrasp.fem.errors import CheckpointError, raise_on_all_ranks
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement, vertex_values
-from softgrasp.study.pictures.shapes import way_done
+from softgrasp.study.pictures.shapes import path_fraction
 
 if TYPE_CHECKING:
     from softgrasp.fem.fields.traction import ContactTraction
@@ -147,7 +147,7 @@ class Frames:
         """Steps of the still picture before they are reached; the hand's table is known unless forces drive it."""
         grid = frame_steps(self.model.scene, self.model.system.layout.n_e)
         times = np.arange(len(run.drive.q), dtype=np.float64)
-        done = way_done(np.column_stack([times, run.drive.q]), times[grid])
+        done = path_fraction(np.column_stack([times, run.drive.q]), times[grid])
         return {grid[int(np.argmin(abs(done - share)))] for share in SHOWN[:-1]} | {grid[-1]}
 
     def close(self) -> list[Path]:

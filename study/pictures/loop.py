@@ -92,7 +92,7 @@ def histories(
             # the last swings have no later ones to be compared with
             keep = slice(0, max(2, int(0.97 * len(times))), _every(len(times)))
             for look, (y, _) in zip(_looks(), runs.values(), strict=False):
-                axes[-1].semilogy(times[keep], still_to_come(y, aim, columns)[keep], color=style.OUTLINE, **look)
+                axes[-1].semilogy(times[keep], settling_distance(y, aim, columns)[keep], color=style.OUTLINE, **look)
             axes[-1].set_ylabel("distance to target,\nlargest from then on [m]")
             axes[-1].set_xlim(0.0, float(times[-1]))
             axes[-2].set_xlabel("time [s], the move only")
@@ -143,7 +143,7 @@ def _looks() -> Iterator[dict[str, Any]]:
         yield {"ls": STYLES[number % len(STYLES)], "lw": 1.0, "alpha": 1.0}
 
 
-def still_to_come(outputs: Array, target: Array, columns: Columns = ()) -> Array:
+def settling_distance(outputs: Array, target: Array, columns: Columns = ()) -> Array:
     """Largest distance from each instant on: how well the outputs have settled, without the swings. Shape (m,).
 
     Args and distance as in :func:`softgrasp.fem.columns.farthest`.

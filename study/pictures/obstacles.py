@@ -12,7 +12,7 @@ from matplotlib.patheffects import withStroke
 
 from softgrasp.fem import Array, Ball, HalfSpace, Obstacle, Polytope, Shape
 from softgrasp.study.pictures import shapes
-from softgrasp.study.pictures.shapes import Shot
+from softgrasp.study.pictures.shapes import MoveView
 from softgrasp.study.pictures.style import HAND, OUTLINE
 
 GREY = "#d9d9d9"
@@ -64,24 +64,24 @@ def extent(obstacles: tuple[Obstacle, ...], times: Array, room: Array, box: Arra
     return box
 
 
-def draw_surroundings(ax: Any, shot: Shot, numbers: list[int]) -> None:
+def draw_surroundings(ax: Any, move: MoveView, numbers: list[int]) -> None:
     """Obstacles at instants of a move, those at rest once, and in the plane arrows of the pressure on each body."""
-    solid = shot.picture.dimension == 3
+    solid = move.picture.dimension == 3
     box = np.array([ax.get_xlim(), ax.get_ylim()]).T
-    for obstacle in shot.picture.obstacles:
+    for obstacle in move.picture.obstacles:
         for k in numbers if obstacle.path is not None else numbers[:1]:
             if solid:
-                _draw_solid(ax, obstacle.shape, np.zeros(3) + obstacle.shift(shot.times[k]), shot.room)
+                _draw_solid(ax, obstacle.shape, np.zeros(3) + obstacle.shift(move.times[k]), move.room)
             else:
-                draw_obstacle(ax, obstacle.shape, obstacle.name, box, obstacle.shift(shot.times[k]))
-    if shot.tractions is None or solid:
+                draw_obstacle(ax, obstacle.shape, obstacle.name, box, obstacle.shift(move.times[k]))
+    if move.tractions is None or solid:
         return
     for k in numbers:
-        x, load = shot.picture.points + shot.states[k], shot.tractions[k]
+        x, load = move.picture.points + move.states[k], move.tractions[k]
         size = np.linalg.norm(load, axis=1)
-        on = size > LEAST * shot.pressure
+        on = size > LEAST * move.pressure
         if on.any():
-            arrows = load[on] * (LONGEST * float(np.ptp(shot.picture.points, axis=0).min()) / shot.pressure)
+            arrows = load[on] * (LONGEST * float(np.ptp(move.picture.points, axis=0).min()) / move.pressure)
             look: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1, "pivot": "tip", "units": "inches"}
             head = {"headwidth": 4.0, "headlength": 5.0, "headaxislength": 4.5}
             ax.quiver(*x[on].T, *arrows.T, color=HAND, width=0.012, zorder=6, **look, **head)

@@ -17,8 +17,8 @@ MARGIN = 0.08  # of a body's smaller side, kept free between two bodies of one p
 
 
 @dataclass(frozen=True)
-class Shot:
-    """What every view of one move shares."""
+class MoveView:
+    """A move as all its views have it: states, colours, and the corners of what is seen."""
 
     picture: PictureMesh  # the body
     states: Array  # absolute vertex displacements at the instants, shape (k, n, d) [m]
@@ -65,7 +65,7 @@ def pick_instants(picture: PictureMesh, states: Array, times: Array, table: Arra
     last = len(states) - 1
     if last < 3:
         return list(range(last + 1))
-    done = way_done(table, times)
+    done = path_fraction(table, times)
     if not ((done > 0.02) & (done < 0.98)).any():  # frames are too far apart to see the move
         done = (times - times[0]) / (times[-1] - times[0])
     hands = hands_at(table, times)
@@ -90,7 +90,7 @@ def pick_instants(picture: PictureMesh, states: Array, times: Array, table: Arra
     return sorted({0, last, *(int(h[np.argmax(bent[h])]) for h in halves if len(h))})
 
 
-def way_done(table: Array, times: Array) -> Array:
+def path_fraction(table: Array, times: Array) -> Array:
     """Share of the hand's way that is behind it at the given times [1]; of the time if the hand rests."""
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(table[:, 1:], axis=0), axis=1)))
     at = np.interp(times, table[:, 0], way) if way[-1] > 0 else np.asarray(times, dtype=np.float64)

@@ -189,7 +189,7 @@ class Answers:
         best = min(every, key=lambda p: p.error)
         words = [
             f"Nothing tried meets {tolerance:g}; closest is {best.label} with an error of {percent(best.error)}, "
-            f"give or take {percent(self.truth.error)}, in {seconds_text(best.seconds)}."
+            f"known to within {percent(self.truth.error)}, in {seconds_text(best.seconds)}."
         ]
         words.append(advice(self.shares(best)))
         large = self.too_large(tolerance)

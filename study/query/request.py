@@ -134,6 +134,6 @@ def _check_memory(model: CertifiedModel, steps: float, runs: int, what: str) -> 
     most = free_memory() / need
     if steps > most:
         raise SceneError(
-            f"{what} in {steps:.3g} steps would take about {size_text(steps * need)} of memory, and "
-            f"{size_text(most * need)} is free; take {most:.2g} steps or fewer, by a larger --dt"
+            f"{what} in {steps:.3g} steps would need about {size_text(steps * need)} of memory, and "
+            f"{size_text(most * need)} is free; use {most:.2g} steps or fewer, by a larger --dt"
         )

@@ -70,7 +70,7 @@ def parse_axis(text: str) -> SweepAxis:
 
 
 def parse_axes(texts: Sequence[str]) -> tuple[SweepAxis, ...]:
-    """:func:`parse_axis` of every text. Raises SceneError: also where a key stands twice, or for too many points."""
+    """:func:`parse_axis` of every text. Raises SceneError: also where a key is given twice, or for too many points."""
     axes = tuple(parse_axis(text) for text in texts)
     keys = [axis.key for axis in axes]
     if twice := next((shortened(key) for key in keys if keys.count(key) > 1), None):

@@ -16,7 +16,7 @@ def serve(
     host: Annotated[str, typer.Option(help="address; other machines reach it unless it is of the loopback")] = (
         "127.0.0.1"
     ),
-    port: Annotated[int, typer.Option(help="port; 0 takes a free one", min=0, max=65535)] = 4242,
+    port: Annotated[int, typer.Option(help="port; 0 chooses a free one", min=0, max=65535)] = 4242,
 ) -> None:
     """Let tools of uncertainty quantification ask a certified model, by the UM-Bridge protocol.
 

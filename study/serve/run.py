@@ -32,7 +32,7 @@ def served_model(path: Path, inputs: str) -> Served:
         raise SceneError(f"{path}: name the certified model that softgrasp reduce SCENE --tolerance wrote")
     model = load_certified(path)
     if model.drive is None:
-        raise SceneError(f"{path} holds no motion; reduce its scene again")
+        raise SceneError(f"{path} has no motion; reduce its scene again")
     return Served(model, model.drive, names)
 
 

@@ -195,7 +195,7 @@ FAMILIES = (
            resonance_rows),
     Family("held", "Cost of loops that hold and wait", "loop", "true excess cost / proved bound",
            "exponential of a tick and a discrete Lyapunov equation",
-           "The optimal gain costs nothing more in continuous time; sampled and late it does. Dense matrices tell it "
-           "of a loop without limits and small; the bound takes a run and its adjoint, of any size, with limits.",
+           "The optimal gain costs nothing more in continuous time; sampled and late it does. Dense matrices give it "
+           "for a small loop without limits; the bound needs a run and its adjoint, of any size, with limits.",
            held_rows, axis="listed"),
 )  # fmt: skip

@@ -41,14 +41,14 @@ class FiniteContactMidpoint(Touching, FiniteStrainMidpoint):
         """
         if self.jump is not None:
             raise SolverError(
-                "contact at finite strain cannot act in a step that is divided into substeps; take more time.steps"
+                "contact at finite strain cannot act in a step that is divided into substeps; raise time.steps"
             )
         self.right = self.free_load + pressing
         root = self._find(self.w_array + change)
         if root.iterations < 0:
             raise SolverError(
                 f"contact at finite strain ({self.body.law.name}): the step does not converge under the forces of the "
-                "obstacles; take more time.steps or a gentler motion"
+                "obstacles; raise time.steps or use a slower motion"
             )
         counts = self.counts
         counts.iterations += root.iterations

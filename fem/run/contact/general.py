@@ -49,7 +49,7 @@ def unsettled(reached: float) -> SolverError:
     """The error of a step whose rounds leave a gap [m]."""
     return SolverError(
         f"contact: {MOST} rounds leave a gap of {reached:.2g} m at pressed nodes; obstacles that leave the tissue no "
-        "room, or are small against the cells, are the usual reason: move one, take smaller cells or more time.steps"
+        "room, or are small against the cells, are the usual reason: move one, use smaller cells or raise time.steps"
     )
 
 
@@ -159,7 +159,7 @@ class Contact:
             o, i = np.unravel_index(self.gaps.argmin(), self.gaps.shape)
             place = ", ".join(f"{c:.4g}" for c in x[i])
             raise SceneError(
-                f"obstacle '{self.obstacles[o].name}' holds the point of the tissue at ({place}) m at the start, "
+                f"obstacle '{self.obstacles[o].name}' contains the point of the tissue at ({place}) m at the start, "
                 f"{-self.gaps[o, i]:.3g} m deep; move it, or start elsewhere"
             )
 

@@ -71,5 +71,5 @@ def _forces(contact: Contact, responses: Responses, q: Array, free: Array) -> Ar
         before, z = z, free + responses.surface[:, : len(f)] @ f
         moved = float(np.abs(z - before).max())
     raise SolverError(
-        f"contact: no equilibrium with the obstacles after {MOST} rounds; move them, or take time.start = 'rest'"
+        f"contact: no equilibrium with the obstacles after {MOST} rounds; move them, or set time.start = 'rest'"
     )

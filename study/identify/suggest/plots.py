@@ -1,4 +1,4 @@
-"""The body with the candidates for markers, coloured by what each would tell alone, and the chosen ones."""
+"""The body with the candidates for markers, coloured by the error with each alone, and the chosen ones."""
 
 from __future__ import annotations
 

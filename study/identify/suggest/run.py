@@ -79,7 +79,7 @@ def parse_sigma(text: str) -> float:
 def parse_motions(texts: Sequence[str]) -> list[dict[str, Any]]:
     """All motions of ``duration=0.5;1`` and ``target=[1,0];[0,1]``: every value with every other.
 
-    Raises SceneError: a text is no key with values, a key stands twice, or the motions are too many.
+    Raises SceneError: a text is no key with values, a key is given twice, or the motions are too many.
     """
     axes: dict[str, list[Any]] = {}
     for text in texts:

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from softgrasp.reduction import PAPER_METHODS
 from softgrasp.study.pictures import film, gif_bytes, hands_at, style, timing, write_gif
-from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, outline, settle
+from softgrasp.study.pictures.body import MoveView, colour_bar, draw_scene, make_axes, make_view, outline, settle
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, by_error, unbeaten
 from softgrasp.study.reduce.linear.views import Views
 
@@ -219,23 +219,23 @@ def figure_modes(views: Views, out_png: Path) -> tuple[Path, ...]:
     if len(near):  # the hand moves by columns of its own: shown where the tissue beside it goes
         hands[free, : picture.dimension] = shapes[free][:, near].mean(axis=1)
         shapes[:, held] = np.stack([picture.rigid(q)[held] for q in hands])
-    shot = make_shot(picture, shapes, times, np.column_stack([times, hands]), None)
-    shot = replace(shot, path=shot.path[:1])
+    move = make_view(picture, shapes, times, np.column_stack([times, hands]), None)
+    move = replace(move, path=move.path[:1])
     with style.paper_style():
-        figure, axes = make_axes(shot, len(shapes), captions=True, width=style.WIDTH, tallest=5.0)
+        figure, axes = make_axes(move, len(shapes), captions=True, width=style.WIDTH, tallest=5.0)
         for ax, title in zip(axes, titles, strict=True):
             ax.set_title(title, pad=3, fontsize=6.5)
         settle(figure)
-        for ax, shape, hand in zip(axes, shapes, shot.hands, strict=True):
-            draw_scene(ax, shot, shape[None], None, hand[None])
+        for ax, shape, hand in zip(axes, shapes, move.hands, strict=True):
+            draw_scene(ax, move, shape[None], None, hand[None])
         return style.save(figure, out_png)
 
 
-def _figure(views: Views, note: str = "") -> tuple[Any, list[Any], Shot]:
+def _figure(views: Views, note: str = "") -> tuple[Any, list[Any], MoveView]:
     """Axes for every reduced model in the frame of the full one, so that one that grew does not shrink the picture."""
     width = style.WIDTH if len(views.reduced) > 1 else style.COLUMN + 1
-    shot = make_shot(views.picture, views.full, views.times, views.table, None)
-    figure, axes = make_axes(shot, len(views.reduced), captions=True, width=width, tallest=3.6)
+    move = make_view(views.picture, views.full, views.times, views.table, None)
+    figure, axes = make_axes(move, len(views.reduced), captions=True, width=width, tallest=3.6)
     for ax, view in zip(axes, views.reduced, strict=True):
         ax.set_title(view.title + note, pad=3, fontsize=7)
     entries: list[Any] = [
@@ -243,21 +243,21 @@ def _figure(views: Views, note: str = "") -> tuple[Any, list[Any], Shot]:
         Line2D([], [], label="outline of the full model", **OUTLINE),
     ]
     figure.legend(handles=entries, loc="outside upper center", ncols=2)
-    colour_bar(figure, axes, shot)
+    colour_bar(figure, axes, move)
     settle(figure)
-    return figure, axes, shot
+    return figure, axes, move
 
 
-def _draw(axes: Sequence[Any], shot: Shot, views: Views, k: int) -> None:
+def _draw(axes: Sequence[Any], move: MoveView, views: Views, k: int) -> None:
     """Every reduced model at one frame under the outline of the full one."""
     lines = outline(views.picture, views.picture.points + views.full[k])
     for ax, view in zip(axes, views.reduced, strict=True):
-        draw_scene(ax, shot, view.states[k : k + 1], None, shot.hands[k : k + 1])
+        draw_scene(ax, move, view.states[k : k + 1], None, move.hands[k : k + 1])
         ax.add_collection(LineCollection(lines, zorder=7, **OUTLINE), autolim=False)
 
 
 def instants(views: Views) -> list[int]:
-    """Frames of large deformation and large error whose bodies do not cover each other, the most telling first."""
+    """Frames of large deformation and large error whose bodies do not cover each other, the largest first."""
     rigid = [views.picture.rigid(q) for q in hands_at(views.table, views.times)]
     deformation = np.array([np.abs(u - r).max() for u, r in zip(views.full, rigid, strict=True)])
     error = np.max([np.abs(view.states - views.full).max(axis=(1, 2)) for view in views.reduced], axis=0)
@@ -279,9 +279,9 @@ def figure_compare(views: Views, out_png: Path) -> tuple[Path, ...]:
     shown = instants(views)
     with style.paper_style():
         times = ", ".join(f"{views.times[k]:.2g}" for k in shown)
-        figure, axes, shot = _figure(views, f"\nbodies at t = {times} s")
+        figure, axes, move = _figure(views, f"\nbodies at t = {times} s")
         for k in shown:
-            _draw(axes, shot, views, k)
+            _draw(axes, move, views, k)
         return style.save(figure, out_png)
 
 
@@ -289,6 +289,6 @@ def gif_compare(views: Views, out_gif: Path) -> Path:
     """The same in motion."""
     kept, durations = timing(views.times)
     with style.paper_style():
-        figure, axes, shot = _figure(views)
-        images = film(figure, axes, partial(_draw, axes, shot, views), kept)
+        figure, axes, move = _figure(views)
+        images = film(figure, axes, partial(_draw, axes, move, views), kept)
     return write_gif(gif_bytes(images, durations), out_gif)

@@ -165,7 +165,7 @@ def test_straight_cells_of_higher_order_are_their_corners(mpi_tmp_path: Path, ki
     assert np.array_equal(arrays.points, points)
     assert volume(read_mesh(COMM, path)) == pytest.approx(2.0, rel=WIDE)
     more[high[4, dimension + 1]] += np.array([0.08, -0.05, 0.06])[:dimension]  # along no edge of the grid
-    with pytest.raises(MeshError, match=rf"1 curved cell of type {kind}.*lies 0\.0\d+ m off"):
+    with pytest.raises(MeshError, match=rf"1 curved cell of type {kind}.*lies 0\.0\d+ m from"):
         read_mesh(COMM, save(mpi_tmp_path / f"b{suffix}", more, [(kind, high)]))
 
 
@@ -238,11 +238,11 @@ def test_curved_hexahedra_and_quadrilaterals_are_found() -> None:
             off[len(corners), -1] -= 0.03
             with pytest.raises(
                 MeshError,
-                match=rf"1 curved cell of type {kind}, .* 0\.03 m off .*: export the mesh with smaller cells, ",
+                match=rf"1 curved cell of type {kind}, .* 0\.03 m from .*: export the mesh with smaller cells, ",
             ):
                 check_straight(off, nodes, kind.rstrip("0123456789"), kind, "a")
     x[20, 0] -= 0.05  # the middle of the face x = 0
-    with pytest.raises(MeshError, match=r"hexahedron27, .* 0\.05 m off .* at \(-0\.05, 0\.5, 0\.5\)"):
+    with pytest.raises(MeshError, match=r"hexahedron27, .* 0\.05 m from .* at \(-0\.05, 0\.5, 0\.5\)"):
         check_straight(x, nodes, "hexahedron", "hexahedron27", "a")
 
 

@@ -23,7 +23,7 @@ REFUSED = [
     (f"{{{TABLE}, radius=1}}", "obstacle.0.radius does not go with kind = 'halfspace'; a halfspace takes"),
     (f"{{{TABLE}, raduis=1}}", "obstacle.0.raduis is not a key; did you mean obstacle.0.radius?"),
     ("{kind='disc', center=[0, 9, 1], radius=1}", "obstacle.0.center has a vector of 3 entries; it must have 2"),
-    ("{kind='ball', center=[0, 9, 1], radius=1}", "obstacle.0.kind is 'ball', of 3D; in this 2D scene take 'disc'"),
+    ("{kind='ball', center=[0, 9, 1], radius=1}", "obstacle.0.kind is 'ball', of 3D; in this 2D scene use 'disc'"),
     ("{kind='disc', center=[0, 9], radius=0}", "obstacle.0.radius is 0; it must be > 0"),
     ("{kind='disc', center=[0, nan], radius=1}", "obstacle.0.center.1 is nan; it must be a finite number"),
     ("{kind='box', lo=[0, 5], hi=[1, 5]}", "obstacle.0.hi is [1.0, 5.0]; it must exceed lo"),

@@ -323,7 +323,7 @@ def test_what_contact_cannot_do_is_refused(overrides: list[str], words: str) -> 
 
 
 def test_a_start_inside_and_a_hand_that_meets_an_obstacle_are_refused() -> None:
-    with pytest.raises(SceneError, match=r"obstacle 'disc1' holds the point of the tissue at .* m deep; move it"):
+    with pytest.raises(SceneError, match=r"obstacle 'disc1' contains the point of the tissue at .* m deep; move it"):
         run("obstacle=[{kind='disc', center=[0.5, 0.2], radius=0.3}]")
     model = build("paper_forward", [*SMALL, ON, TABLE])
     held = np.concatenate(MPI.COMM_WORLD.allgather(model.system.layout.held))[0].tolist()

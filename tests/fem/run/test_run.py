@@ -100,7 +100,7 @@ def test_streamed_snapshots_that_are_gone_do_not_resume(comm: MPI.Intracomm, mpi
     mine = mpi_tmp_path / f"snapshots-rank{comm.rank}.h5"
     with h5py.File(mine, "r+") as file:
         file.attrs["written"] = 7 if comm.rank == 0 else 21
-    with pytest.raises(CheckpointError, match="holds 7 snapshots, step 20 needs 21"):
+    with pytest.raises(CheckpointError, match="has 7 snapshots, step 20 needs 21"):
         simulate(small(comm, hdf5), RunOptions(directory=mpi_tmp_path, resume=True))
     if comm.rank == comm.size - 1:
         mine.unlink()

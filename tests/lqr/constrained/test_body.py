@@ -90,7 +90,7 @@ def test_ranks_pick_the_same_nodes_in_the_order_of_their_surface() -> None:
     [
         ("[[9, 0]]", r"body\[0\] = \[9.0, 0.0\] lies outside the body"),
         ("['tap']", "'tap' is no output of kind node; these are tip"),
-        ("['tip', [0.5, 0.01]]", r"takes the node \[0.5, 0.0\] a second time"),
+        ("['tip', [0.5, 0.01]]", r"names the node \[0.5, 0.0\] a second time"),
         ("[[0, 0, 0]]", "must have 2 entries"),
     ],
 )

@@ -151,7 +151,7 @@ def test_multiplier_is_what_a_metre_of_a_gap_costs() -> None:
 def test_programs_beyond_the_memory_are_refused_before_they_are_built() -> None:
     plant, given = task(14, WALL, cells="[4, 8]")
     with pytest.raises(
-        ResourceError, match=r"a plan of 1e\+06 intervals would take about .* control.constraints.horizon"
+        ResourceError, match=r"a plan of 1e\+06 intervals would need about .* control.constraints.horizon"
     ):
         make_plan(plant, given, 1_000_000, 1_000_000)
 

@@ -88,7 +88,7 @@ def test_force_sensor_reads_the_load_that_hangs_on_the_hand() -> None:
     ("markers", "sentence"),
     [
         ([[0.0, 3.0]], "markers[0] = [0.0, 3.0] lies outside the body"),
-        ([[0.0, 0.0], [0.01, 0.0]], "markers[1] = [0.01, 0.0] takes the node [0.0, 0.0] a second time"),
+        ([[0.0, 0.0], [0.01, 0.0]], "markers[1] = [0.01, 0.0] names the node [0.0, 0.0] a second time"),
         ([[0.0, 0.0, 0.0]], "markers[0] = [0.0, 0.0, 0.0] must have 2 entries"),
     ],
 )
@@ -100,5 +100,5 @@ def test_markers_that_do_not_fit_are_refused(markers: list[list[float]], sentenc
     blind, acting = make_sensors(problem, [], Noise(1e-5, force=1.0)), make_disturbance(problem, 0.02, 0.05, None)
     with pytest.raises(ControlError, match="needs markers"):
         full_filter(problem, blind, acting, TICK)
-    with pytest.raises(ControlError, match=r"disturbance.box = \[\[5, 5\], \[6, 6\]\] holds no free node"):
+    with pytest.raises(ControlError, match=r"disturbance.box = \[\[5, 5\], \[6, 6\]\] contains no free node"):
         make_disturbance(problem, 0.02, 0.05, [[5, 5], [6, 6]])

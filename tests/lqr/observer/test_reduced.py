@@ -200,12 +200,12 @@ def test_controller_with_observer_survives_a_file(tmp_path: Path) -> None:
 def test_what_step_cannot_take_is_refused() -> None:
     found = observed()[1].controller
     found.reset()
-    with pytest.raises(ControlError, match="this controller takes 8 samples beside q_s"):
+    with pytest.raises(ControlError, match="this controller needs 8 samples beside q_s"):
         found.step(np.zeros(2), np.zeros(2), np.zeros(3))
     found.reset()
     with pytest.raises(ControlError, match="first samples of the hand must be finite"):
         found.step(np.full(2, np.nan), np.zeros(2))
-    with pytest.raises(ControlError, match="no observer that takes y"):
+    with pytest.raises(ControlError, match="no observer that uses y"):
         replace(found, observer=None).step(np.zeros(2), np.zeros(2), np.zeros(8))
     with pytest.raises(ControlError, match="observer has 14 states, the plant of the controller"):
         replace(found, observer=replace(found.observer, A=np.eye(14), B=np.zeros((14, 3))))

@@ -215,7 +215,7 @@ def test_full_runs_correct_small_models_until_the_noise_hides_what_is_left() -> 
         patch.setattr("softgrasp.reduction.identify.identify.MORE_ROUNDS", 0)
         plain = identify(model(*keys), data(1e-3), "mu,beta", 1e-3, N=10)
     assert (np.abs(plain.parts["reduction"]) > plain.noise).any()  # without the correction
-    assert any("take more than N = 10 columns" in reason for reason in plain.reasons)
+    assert any("use more than N = 10 columns" in reason for reason in plain.reasons)
 
 
 def test_layers_take_no_more_columns_than_one_material() -> None:

@@ -123,7 +123,7 @@ def test_error_of_the_linear_plant_becomes_a_margin_on_request(tmp_path: Path) -
         ("obstacle.0.path={velocity=[0.01, 0.01]}", "obstacle disc moves towards the body at the target until the end"),
         ("effects.reaction=true", "control.constraints.speed limits a hand whose speed changes linearly"),
         ("effects.gravity=[0, -0.1]", "a plan starts with the tissue in equilibrium"),
-        ("control.constraints.horizon=1e9", "a plan of 1e+09 intervals would take about"),
+        ("control.constraints.horizon=1e9", "a plan of 1e+09 intervals would need about"),
         ("control.constraints.grid=1e4", "raise control.constraints.N or lower grid"),
         ("control.constraints.N=9", "N is 9; displacements and velocities come in pairs"),
         ("control.constraints=false", "obstacle is given but nothing in this scene uses it"),

@@ -87,7 +87,7 @@ def measured(model: Any) -> MeasuredScene:
 
 def test_variants_that_do_not_fit_are_refused_with_the_limit_of_the_scene(comm: MPI.Intracomm) -> None:
     explanation: Any = SimpleNamespace(solver=SimpleNamespace(factor_bytes=2.0**30))
-    with pytest.raises(ResourceError, match=r"10.* GiB at once, where 2.* GiB may be taken; .* output.memory=GIB"):
+    with pytest.raises(ResourceError, match=r"10.* GiB at once, where 2.* GiB are available; .* output.memory=GIB"):
         check_variants(make_scene(output={"memory": 2.5}), comm, explanation, 5)
 
 

@@ -22,7 +22,7 @@ from softgrasp.reduction.reduce import reduce
 from softgrasp.study.forward.cautions import small_obstacles
 from softgrasp.study.forward.explain import explain_model
 from softgrasp.study.forward.run import run_simulate
-from softgrasp.study.pictures.body import draw_surroundings, legend, make_axes, make_shot
+from softgrasp.study.pictures.body import draw_surroundings, legend, make_axes, make_view
 from softgrasp.study.pictures.shapes import seen
 from softgrasp.study.pictures.view import Move
 
@@ -137,11 +137,11 @@ def test_pictures_show_obstacles_where_they_are() -> None:
     times, still = np.array([0.0, 1.0]), np.zeros((2, *picture.points.shape))
     push = np.zeros_like(still)
     push[1, 0] = [2000.0, 0.0]  # [Pa]
-    shot = make_shot(picture, still, times, np.column_stack([times, np.zeros((2, 2))]), None, push)
-    assert shot.low[0] <= -1.2  # the picture takes the disc in
-    figure, axes = make_axes(shot, 1, captions=False)
-    draw_surroundings(axes[0], shot, [0, 1])
-    legend(figure, shot)
+    move = make_view(picture, still, times, np.column_stack([times, np.zeros((2, 2))]), None, push)
+    assert move.low[0] <= -1.2  # the picture takes the disc in
+    figure, axes = make_axes(move, 1, captions=False)
+    draw_surroundings(axes[0], move, [0, 1])
+    legend(figure, move)
     lines = [c for c in axes[0].collections if not isinstance(c, Quiver)]
     middles = [line.get_paths()[0].vertices[:-1].mean(axis=0) for line in lines]
     assert np.allclose(middles[:2], [[-1.0, 0.5], [-0.7, 0.5]])  # after 1 s at 0.3 m/s
@@ -161,9 +161,9 @@ def test_obstacles_in_space_are_drawn_by_the_faces_that_are_seen() -> None:
     picture = gather_picture(model)
     assert picture is not None
     times, still = np.zeros(1), np.zeros((1, *picture.points.shape))
-    shot = make_shot(picture, still, times, np.zeros((1, 7)), None)
-    figure, axes = make_axes(shot, 1, captions=False)
-    draw_surroundings(axes[0], shot, [0])
+    move = make_view(picture, still, times, np.zeros((1, 7)), None)
+    figure, axes = make_axes(move, 1, captions=False)
+    draw_surroundings(axes[0], move, [0])
     ball, box, table = axes[0].collections
     assert (len(ball.get_paths()), len(box.get_paths()), len(table.get_paths())) == (1, 3, 1)
     assert ball.get_zorder() > 2 > box.get_zorder()  # the body has 2; the viewer is at negative y

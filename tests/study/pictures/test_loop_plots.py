@@ -12,7 +12,7 @@ from PIL import Image
 
 from softgrasp.fem.columns import OutputColumn, farthest, hand_columns
 from softgrasp.study.pictures import loop as loop_plots
-from softgrasp.study.pictures.loop import figure_decay, histories, still_to_come
+from softgrasp.study.pictures.loop import figure_decay, histories, settling_distance
 from softgrasp.study.pictures.shapes import move_steps
 from softgrasp.study.pictures.style import save
 
@@ -76,9 +76,9 @@ def test_long_runs_are_thinned() -> None:
     assert len(figure.axes[0].lines[0].get_xdata()) <= 2 * loop_plots.MANY_POINTS
 
 
-def test_what_is_still_to_come_never_rises() -> None:
+def test_settling_distance_never_rises() -> None:
     y = np.array([[3.0], [0.0], [-2.0], [1.0], [0.0]])
-    assert still_to_come(y, np.zeros(1)).tolist() == [3.0, 2.0, 2.0, 1.0, loop_plots.NEAREST]
+    assert settling_distance(y, np.zeros(1)).tolist() == [3.0, 2.0, 2.0, 1.0, loop_plots.NEAREST]
 
 
 def test_move_steps_end_with_the_run() -> None:

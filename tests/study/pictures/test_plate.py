@@ -9,7 +9,7 @@ from mpi4py import MPI
 from softgrasp.fem import PictureMesh, gather_picture
 from softgrasp.fem.model.build import build
 from softgrasp.study.pictures.animation import followed, render
-from softgrasp.study.pictures.body import make_shot
+from softgrasp.study.pictures.body import make_view
 from softgrasp.study.pictures.plate import PAD, THICK, around_bodies, hand_plate
 from softgrasp.study.pictures.shapes import seen
 from tests.helpers.models import CUBE, make_scene
@@ -52,9 +52,9 @@ def test_a_film_goes_with_a_body_that_moves_far(cube: PictureMesh) -> None:
     for reach in (3.0, 0.2):
         hands = times[:, None] * reach * np.ones(3)
         states = u + hands[:, None, :] + 0.05 * np.linspace(0.0, 1.0, len(cube.points))[:, None]
-        shot = make_shot(cube, states, times, np.column_stack([times, hands]), None)
-        assert len(followed(shot, states)) == (5 if reach == 3.0 else 0)
-        images = [np.asarray(image, dtype=int) for image in render(shot, states, times)]
+        move = make_view(cube, states, times, np.column_stack([times, hands]), None)
+        assert len(followed(move, states)) == (5 if reach == 3.0 else 0)
+        images = [np.asarray(image, dtype=int) for image in render(move, states, times)]
         coloured.append([float((np.ptp(image, axis=2) > 60).mean()) for image in images])
     far, near = coloured
     assert min(far) > 0.15  # of the picture, the colour bar included
