@@ -274,7 +274,7 @@ def query(
 
     An answer has three errors: of the reduction (proved), of the time step and of the mesh (both estimates).
 
-    Above the tolerance it is refused, with exit status 3: take --fallback full, or --allow to see it all the same.
+    Above the tolerance it is refused, with exit status 3: use --fallback full, or --allow to see it all the same.
 
     Outside the box of the training there is a warning only: the bound holds everywhere.
 

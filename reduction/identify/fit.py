@@ -211,7 +211,7 @@ def fit_rounds(
 
 
 def apart(J: Array, k: int) -> Array:
-    """The first k columns of a Jacobian without what the nuisances, the others, can take over."""
+    """The first k columns of a Jacobian without their projection on the others, the nuisances."""
     if J.shape[1] == k:
         return J
     Q, _ = np.linalg.qr(J[:, k:])

@@ -172,7 +172,7 @@ class Local(ABC):
 
     @abstractmethod
     def system(self, values: Array) -> Any:
-        """What the next two methods take at values. Raises ModelError: they are no material."""
+        """Arguments of the next two methods at values. Raises ModelError: they are no material."""
 
     @abstractmethod
     def small_run(self, small: Any, experiment: Experiment, refined: int = 1) -> ReducedTrajectory:
@@ -212,7 +212,7 @@ class Local(ABC):
         return None
 
     def rests_on(self) -> tuple[Unknown, ...]:
-        """Parameters that are not fitted, which :meth:`slopes` can take."""
+        """Parameters that are not fitted, for which :meth:`slopes` has derivatives."""
         return assumed(self.model, self.unknowns)
 
 

@@ -95,7 +95,7 @@ class SwitchRuns:
         return scene
 
     def refusal(self, on: Names) -> str:
-        """Why the scene does not take exactly these effects; empty where it does."""
+        """Why the scene does not allow exactly these effects; empty where it does."""
         try:
             self.variant(on)
         except SceneError as error:

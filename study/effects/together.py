@@ -34,7 +34,7 @@ JointChanges = dict[str, Shown]
 
 
 def rivals_of(runs: SwitchRuns, needed: Names, changes: Changes) -> dict[str, Rival]:
-    """Of the needed effects that the scene does not take together those that change less."""
+    """Of the needed effects that the scene does not allow together, those that change less."""
     kept, rivals = runs.on, dict[str, Rival]()
     for name in sorted(needed - runs.on, key=lambda name: -changes[name][0].outputs):
         if why := runs.refusal(kept | {name}):

@@ -146,7 +146,7 @@ def inexact(
 
 
 def looked_at(n_e: int) -> int:
-    """Stored instants that the warnings of a run take, with n_e unknowns of the tissue."""
+    """Stored instants that the warnings of a run are computed from, with n_e unknowns of the tissue."""
     return int(np.clip(LARGEST // n_e, 4, LOOKED_AT))
 
 
