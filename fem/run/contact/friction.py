@@ -59,7 +59,7 @@ class RubbingRows(Rows):
 def rubbing_impulse(
     contact: Contact, jolt: Coulomb, rows: RubbingRows, mu: Array, A: Array, v: Array, still: float
 ) -> Array | None:
-    """Impulse with friction (k d,) that stops rows; None where the friction of the step with it would not dissipate energy.
+    """Impulse with friction (k d,) that stops rows; None where friction would not dissipate energy in the step.
 
     Args:
         jolt: problem of the impulses, without forces or sets of its own.
