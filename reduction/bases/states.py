@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from mpi4py import MPI
 
 from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.petsc import Array, rows_on_all, times_columns, total, whole_copy
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError
@@ -88,6 +89,30 @@ class States:
                 _check(self.layout, system, snapshots)
         parts = [_columns(system, snapshots, coordinates, frame) for system, snapshots in self.runs]
         return parts[0] if len(parts) == 1 else Columns.beside(parts)
+
+
+def whole_states(states: States) -> States:
+    """The same states with all rows on every rank, for bases that each rank makes by itself. Collective.
+
+    Bases that use affine components, layers or damping of the system cannot be made from them.
+    """
+    layout = states.layout
+    comm, n = layout.comm, layout.n_local
+    nodes, held = rows_on_all(comm, layout.nodes), rows_on_all(comm, layout.held)
+    own = replace(layout, comm=MPI.COMM_SELF, n_local=layout.n_e, start=0, nodes=nodes, held=held, patches=None)
+
+    def whole(system: BlockSystem) -> BlockSystem:
+        M_ee, K_ee = whole_copy(system.M_ee), whole_copy(system.K_ee)
+        T, G = rows_on_all(comm, system.T), rows_on_all(comm, system.G)
+        return replace(system, layout=own, M_ee=M_ee, K_ee=K_ee, T=T, G=G, kept={})
+
+    def gathered(snapshots: Snapshots) -> Snapshots:
+        Z = np.empty((2 * own.n_e, snapshots.Z.shape[1]), order="F")
+        Z[: own.n_e], Z[own.n_e :] = rows_on_all(comm, snapshots.Z[:n]), rows_on_all(comm, snapshots.Z[n:])
+        return replace(snapshots, layout=own, Z=Z)
+
+    runs = tuple((whole(system), gathered(snapshots)) for system, snapshots in states.runs)
+    return States(whole(states.system), runs)
 
 
 def states_of(system: BlockSystem, snapshots: Snapshots | None = None) -> States:

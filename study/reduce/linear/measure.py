@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem import Reduction, Scene
+from softgrasp.fem.errors import raise_on_all_ranks
+from softgrasp.fem.layout import BlockLayout
 from softgrasp.reduction import Basis, ModelComparison, ModelError, ReducedModel, Truncation, project_scene, registry
-from softgrasp.reduction.bases.states import BasisError, States, states_of
+from softgrasp.reduction.bases.states import BasisError, States, states_of, whole_states
 from softgrasp.reduction.errors import all_at
 from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
@@ -38,6 +41,7 @@ FURTHER = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "ps
 REPEATS, SETUPS = 5, 3  # behind each median of the online time and of the set-up
 METHODS_TESTED = 4  # over the box
 PAPER_FULL, PAPER_REDUCED = 16.22, 0.097  # seconds of [SBRH21]: 2n = 1916, 600 steps, and PSD at N = 14
+WHOLE_BYTES = 2.0**28  # of all snapshots up to which each rank holds their rows and makes bases by itself
 LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
 
 Progress = Callable[[int, int], None]
@@ -91,6 +95,49 @@ def bases_of(
     return (), None
 
 
+Made = tuple[tuple[Basis, ...], int | None, dict[int, str]]
+"""Bases of one method, the columns that keep the scene's share of the energy, and the sizes refused."""
+
+
+def made_apart(tasks: Sequence[tuple[str, list[int]]], states: States, options: Reduction) -> dict[str, Made]:
+    """Bases of several methods, each made by one rank alone, with all rows of small snapshots. Collective.
+
+    Left out, because all ranks make them together: everything on one rank or for large snapshots, and methods that use
+    more than snapshots and matrices.
+
+    ``tasks``: names and sizes.
+
+    Raises SolverError: a factorisation failed.
+    """
+    comm, layout = states.layout.comm, states.layout
+    size = sum(16 * layout.n_e * snapshots.Z.shape[1] for _, snapshots in states.runs)
+    apart = [(name, sizes) for name, sizes in tasks if name in registry.METHODS and registry.METHODS[name].snapshots]
+    if comm.size == 1 or len(apart) < 2 or not 0 < size <= WHOLE_BYTES:
+        return {}
+    # pairs factor twice as many columns: they are dealt first
+    apart.sort(key=lambda task: not registry.METHODS[task[0]].pairs)
+    whole, made = whole_states(states), {}
+    with raise_on_all_ranks(comm):
+        for name, sizes in apart[comm.rank :: comm.size]:
+            refused: dict[int, str] = {}
+            made[name] = *bases_of(name, whole, sizes, options, refused), refused
+    return {name: _dealt(layout, made.get(name), i % comm.size) for i, (name, _) in enumerate(apart)}
+
+
+def _dealt(layout: BlockLayout, made: Made | None, owner: int) -> Made:
+    """The local rows of bases whose rows are all on one rank. Collective."""
+    starts, parts = layout.comm.allgather((layout.start, layout.n_local)), None
+    nowhere: Any = None  # a communicator cannot be sent
+    if made is not None:
+        bases, *about = made
+        parts = [
+            (tuple(replace(b, layout=nowhere, V_q=b.V_q[i : i + n], V_p=b.V_p[i : i + n]) for b in bases), *about)
+            for i, n in starts
+        ]
+    bases, kept, refused = layout.comm.scatter(parts, root=owner)
+    return tuple(replace(b, layout=layout) for b in bases), kept, refused
+
+
 def measured(
     bases: Sequence[Basis], full: FullRun, refused: dict[int, str], progress: Progress = lambda done, of: None
 ) -> Iterator[tuple[ReducedModel, Point]]:
@@ -139,10 +186,21 @@ def measure(model: ReducedModel, full: FullRun, comparison: ModelComparison) -> 
     )
 
 
-def sweep(name: str, full: FullRun, options: Reduction, progress: Progress = lambda done, of: None) -> MethodSweep:
-    """One method at all its N. Collective. Raises SolverError: a factorisation failed."""
+def sweep(
+    name: str,
+    full: FullRun,
+    options: Reduction,
+    progress: Progress = lambda done, of: None,
+    made: Made | None = None,
+) -> MethodSweep:
+    """One method at all its N. Collective. Raises SolverError: a factorisation failed.
+
+    ``made``: its bases, as of :func:`made_apart`; None: made here.
+    """
     refused: dict[int, str] = {}
-    bases, kept = bases_of(name, states_of(full.model.system, full.snapshots), options.N, options, refused)
+    if made is None:
+        made = *bases_of(name, states_of(full.model.system, full.snapshots), options.N, options, refused), refused
+    bases, kept, refused = made
     points: list[Point] = []
     models: dict[int, ReducedModel] = {}
     for model, point in measured(bases, full, refused, progress):
@@ -162,19 +220,24 @@ def sweep_all(names: Sequence[str], full: FullRun, say: Say) -> tuple[MethodSwee
     def swept(i: int, done: int, of: int) -> None:
         say(names[i], size * i + size * done // of, size * len(names))
 
-    return tuple(sweep(name, full, options, partial(swept, i)) for i, name in enumerate(names))
+    states = states_of(full.model.system, full.snapshots)
+    made = made_apart([(name, options.N) for name in names], states, options)
+    return tuple(sweep(name, full, options, partial(swept, i), made.pop(name, None)) for i, name in enumerate(names))
 
 
 def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | None) -> list[TestedModel]:
     """Models of the best methods at two N: those of the sweep, and from ``states`` with the same N. Collective."""
-    outputs, models = full.model.outputs, []
-    for s, _ in by_error(sweeps)[:METHODS_TESTED]:
-        sizes = {p.N for N in (COMPARED, LARGER) if (p := nearest(s.points, N)) is not None}
-        own = [s.models[N] for N in sorted(sizes)]
+    outputs, options, models = full.model.outputs, full.model.scene.reduction, []
+    tested = [s for s, _ in by_error(sweeps)[:METHODS_TESTED]]
+    sizes = [sorted({p.N for N in (COMPARED, LARGER) if (p := nearest(s.points, N)) is not None}) for s in tested]
+    tasks = [(s.method.key, own) for s, own in zip(tested, sizes, strict=True)]
+    made = made_apart(tasks, states, options) if states else {}
+    for s, wanted in zip(tested, sizes, strict=True):
+        own = [s.models[N] for N in wanted]
         models += [TestedModel(s.method, False, model) for model in own]
         if states is None or not s.method.snapshots:
             continue
-        bases, _ = bases_of(s.method.key, states, [model.N for model in own], full.model.scene.reduction, {})
+        bases, *_ = made.get(s.method.key) or bases_of(s.method.key, states, wanted, options, {})
         several = [project_scene(b, full.model, outputs) for b, _ in zip(bases, own, strict=False)]
         models += [TestedModel(s.method, True, model) for model in several]
     return models

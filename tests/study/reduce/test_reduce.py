@@ -21,11 +21,19 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.reduction.archive import load
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS, make_bases
-from softgrasp.reduction.bases.states import BasisError, States
+from softgrasp.reduction.bases.states import BasisError, States, states_of
 from softgrasp.reduction.parameters import grid_of, outside, training_of, training_states
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, full_run, replay_linear
-from softgrasp.study.reduce.linear.measure import FURTHER, box_models, headline_turns, measure_box, sweep
+from softgrasp.study.reduce.linear.measure import (
+    FURTHER,
+    bases_of,
+    box_models,
+    headline_turns,
+    made_apart,
+    measure_box,
+    sweep,
+)
 from softgrasp.study.reduce.linear.plots import instants
 from softgrasp.study.reduce.linear.views import gather_views
 from softgrasp.study.reduce.run import run_reduce
@@ -218,6 +226,27 @@ def test_every_rank_count_gives_the_same(small: FullRun) -> None:
             for key in ("error", "error_canonical", "error_deformation", "error_energy", "projection_error"):
                 # rounding of the snapshots over the gap of the singular values
                 assert getattr(p, key) == pytest.approx(getattr(q, key), rel=1e-5), (name, key)
+
+
+@pytest.mark.ranks
+def test_bases_that_one_rank_makes_are_those_of_all_ranks_together(small: FullRun) -> None:
+    states, options = states_of(small.model.system, small.snapshots), wanted(small, [8, 14])
+    names = ("pod_fixed", "psd", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "craig_bampton")
+    apart = made_apart([(name, [3, 8, 14, 4000]) for name in names], states, options)
+    layout = states.layout
+    assert set(apart) == (set(names[:-1]) if layout.comm.size > 1 else set())  # the last uses no snapshots
+    for name, (bases, kept, refused) in apart.items():
+        reasons: dict[int, str] = {}
+        others, own = bases_of(name, states, [3, 8, 14, 4000], options, reasons)
+        assert (kept, refused) == (own, reasons), name
+        for one, all_ranks in zip(bases, others, strict=True):
+            assert one.layout is layout
+            assert one.N == all_ranks.N
+            V, W = (gather_states(layout, np.vstack([b.V_q, b.V_p])) for b in (one, all_ranks))
+            first = 4 if one.fixed_solid else 0  # columns of the hand alone
+            V, W = (np.linalg.qr(X[:, first:] / np.linalg.norm(X[:, first:], axis=0))[0] for X in (V, W))
+            # rounding of the snapshots over the gap of the singular values
+            assert np.linalg.norm(V - W @ (W.T @ V)) < 1e-6, (name, one.N)
 
 
 # --- other parameters
