@@ -25,6 +25,7 @@ from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.petsc import Array, PETSc, from_options, on_root, total
+from softgrasp.reduction.bases.aside import aside
 from softgrasp.reduction.bases.states import BasisError
 
 EngineName = Literal["tsqr", "svd", "gram"]
@@ -160,7 +161,8 @@ def _svd(comm: MPI.Intracomm, X: Array, rows: int, k: int | None) -> tuple[Array
 
 def _flat(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
     """QR of what each rank has, then of the stacked triangles on rank 0: for few rows."""
-    Q_local, R_local = np.linalg.qr(X)
+    with aside():
+        Q_local, R_local = np.linalg.qr(X)
     if comm.size == 1:
         return np.asfortranarray(Q_local), R_local
     parts, blocks, R = comm.gather(R_local), None, None
@@ -210,7 +212,8 @@ def small_svd(comm: MPI.Intracomm, R: Any) -> tuple[Any, Array, Any]:
 
     def call() -> tuple[Any, Array, Any]:
         try:
-            U, s, V_h = scipy.linalg.svd(R, full_matrices=False)
+            with aside():
+                U, s, V_h = np.linalg.svd(R, full_matrices=False)
         except np.linalg.LinAlgError:
             U, s, V_h = scipy.linalg.svd(R, full_matrices=False, lapack_driver="gesvd")
         pivot = V_h[np.arange(len(s)), np.abs(V_h).argmax(axis=1)]

@@ -15,6 +15,7 @@ from softgrasp.fem import Reduction, Scene
 from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.reduction import Basis, ModelComparison, ModelError, ReducedModel, Truncation, project_scene, registry
+from softgrasp.reduction.bases.aside import cores, in_threads
 from softgrasp.reduction.bases.states import BasisError, States, states_of, whole_states
 from softgrasp.reduction.errors import all_at
 from softgrasp.reduction.online import run
@@ -102,8 +103,8 @@ Made = tuple[tuple[Basis, ...], int | None, dict[int, str]]
 def made_apart(tasks: Sequence[tuple[str, list[int]]], states: States, options: Reduction) -> dict[str, Made]:
     """Bases of several methods, each made by one rank alone, with all rows of small snapshots. Collective.
 
-    Left out, because all ranks make them together: everything on one rank or for large snapshots, and methods that use
-    more than snapshots and matrices.
+    A rank that is alone makes them by threads. Left out, because all ranks make them together later: everything for
+    large snapshots or on one core, and methods that use more than snapshots and matrices.
 
     ``tasks``: names and sizes.
 
@@ -112,15 +113,26 @@ def made_apart(tasks: Sequence[tuple[str, list[int]]], states: States, options: 
     comm, layout = states.layout.comm, states.layout
     size = sum(16 * layout.n_e * snapshots.Z.shape[1] for _, snapshots in states.runs)
     apart = [(name, sizes) for name, sizes in tasks if name in registry.METHODS and registry.METHODS[name].snapshots]
-    if comm.size == 1 or len(apart) < 2 or not 0 < size <= WHOLE_BYTES:
+    few = comm.size * (cores() if MPI.COMM_WORLD.size == 1 else 1) == 1  # threads beside ranks would share their cores
+    if comm.bcast(few) or len(apart) < 2 or not 0 < size <= WHOLE_BYTES:
         return {}
     # pairs factor twice as many columns: they are dealt first
     apart.sort(key=lambda task: not registry.METHODS[task[0]].pairs)
-    whole, made = whole_states(states), {}
+    whole, made = whole_states(states) if comm.size > 1 else states, dict[str, Made]()
+
+    def make(name: str, sizes: list[int]) -> Made:
+        refused: dict[int, str] = {}
+        return *bases_of(name, whole, sizes, options, refused), refused
+
+    own = apart[comm.rank :: comm.size]
     with raise_on_all_ranks(comm):
-        for name, sizes in apart[comm.rank :: comm.size]:
-            refused: dict[int, str] = {}
-            made[name] = *bases_of(name, whole, sizes, options, refused), refused
+        if comm.size == 1:
+            results = in_threads([partial(make, *task) for task in own])
+        else:
+            results = [make(*task) for task in own]
+        made = {name: result for (name, _), result in zip(own, results, strict=True)}
+    if comm.size == 1:
+        return made
     return {name: _dealt(layout, made.get(name), i % comm.size) for i, (name, _) in enumerate(apart)}
 
 
