@@ -2,8 +2,9 @@
 
 A row is left out where the box about the first plan and the largest swings in it cannot use up what the plan leaves of
 it; :meth:`softgrasp.lqr.program.program.Program.judge` takes no plan that leaves either, so that none of them is ever
-broken. What follows the horizon is safe where sum_m b_m |w_m| <= 1 for x = V w in the modes of u = K x, since
-|r F^t x| <= sum_m |r V_m| |w_m|: b_m is the largest |r V_m| over what row r has left at the target.
+broken. Rows that others imply are left out too, see :mod:`softgrasp.lqr.constrained.thin`. What follows the horizon is
+safe where sum_m b_m |w_m| <= 1 for x = V w in the modes of u = K x, since |r F^t x| <= sum_m |r V_m| |w_m|: b_m is the
+largest |r V_m| over what row r has left at the target.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from softgrasp.lqr.constrained.horizon import HeldPlant, held
 from softgrasp.lqr.constrained.plan import ROOM, Plan, _price
 from softgrasp.lqr.constrained.rows import Limits, _pace, both_ends, follow, swings
 from softgrasp.lqr.constrained.task import at_target, free_ways, instants, path_turns
+from softgrasp.lqr.constrained.thin import Order, coarse_to_fine, thinned
 from softgrasp.lqr.loop.controller import Controller
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.program.program import HARD, Program, octagon
@@ -29,6 +31,8 @@ STILL = 3e-3  # of the extent: the same, and bend, of a mode that the first plan
 FASTER = 1.0  # times the largest swing of a mode in it: by how much it may swing more
 FREER = 3.0  # times the largest force of the first plan, where the scene limits none
 DIGITS = 1e-10  # of the extent: what a row keeps beyond its bound, so that rounding breaks none
+GIVEN = 0.02  # of the gap of the first plan: what a row may keep for others that it stands for
+NEARBY = 0.05  # of the box, and of the swings beyond the planned ones: where this is enough for them
 ROUNDS = 4  # of the first plan under its own rows
 TAIL = 50  # intervals behind the horizon whose swings the rows at the target have room for
 ROUNDING = 1e-6  # of the extent: a deviation that the steps of another rule make
@@ -139,8 +143,9 @@ def make_program(plan: Plan, T: Array, x_bar: Array, ticks: Ticks, period: float
     force, reason = limits.force, ""
     if force is None:
         force = FREER * np.abs(plan.inputs).max(axis=0)
-    for _ in range(ROUNDS):  # the room between two instants is that of the plan before
-        program = _program(plan, T, x_bar, ticks, every, force)
+    order = coarse_to_fine(plan.task.places)
+    for i in range(ROUNDS):  # the room between two instants is that of the plan before
+        program = _program(plan, T, x_bar, ticks, every, force, order, NEARBY if i < ROUNDS // 2 else 1.0)
         begins = replace(program, c=program.solve(0, program.start)[0])
         reason = begins.judge(0, program.start, begins.c)
         if not reason:
@@ -149,17 +154,22 @@ def make_program(plan: Plan, T: Array, x_bar: Array, ticks: Ticks, period: float
     raise ControlError(f"the plan is not safe with the coarser bounds of a program online: {reason}")
 
 
-def _program(plan: Plan, T: Array, x_bar: Array, ticks: Ticks, every: int, force: Array) -> Program:
-    """The program with what a plan needs between two instants."""
+def _program(
+    plan: Plan, T: Array, x_bar: Array, ticks: Ticks, every: int, force: Array, order: Order, nearby: float
+) -> Program:
+    """The program with what a plan needs between two instants; ``nearby``: see :data:`NEARBY`."""
     plant, task, H, limits = plan.horizon.plant, plan.task, plan.horizon.steps, plan.task.limits
     flow, n_s = _Flow(plant, limits.jump is not None), plant.n_s
     A, B = (np.stack(parts) for parts in zip(*plant.held, strict=True))
     flows, drives = flow.wide(A + B @ plant.K), B @ plant.L  # (parts + 1, N, n), (parts + 1, N, n_s)
     F, D = flow.long(flows[-1], flow.wide(plant.K)), flow.long(drives[-1], plant.L)
-    rows = _Rows(flow, H, flows, drives, (plant.grid / plant.parts) ** 2 / 8, DIGITS * plan.task.size)
+    chord = (plant.grid / plant.parts) ** 2 / 8
+    rows = _Rows(flow, H, flows, drives, chord, DIGITS * task.size, order, nearby)
     first_way = _way(plan, rows.chord)
     first = _all_rows(rows, plan, first_way, force, F, D)
-    a, d, free, exact, obstacle, part, leaves, along = rows.arrays()
+    a, d, free, exact, obstacle, part, leaves, along, spread, instant = rows.arrays()
+    boxes = zip(first_way.boxes, first_way.planned, first_way.most, strict=True)
+    reach = np.stack([rows.reach(*box)[0] for box in boxes])
     real, imag = _tail(plan, flow, flows, F, force, limits)
     lags, power = [d], a
     for _ in range(H - 1):
@@ -182,6 +192,7 @@ def _program(plan: Plan, T: Array, x_bar: Array, ticks: Ticks, every: int, force
         flows[:, first_way.near], drives[:, first_way.near], way, first_way.c, first_way.boxes,
         real, imag, flow.wide(plant.Y.reshape(-1, plant.N)), tube.ravel(), way[0],
         first_way.c, _price(plan.horizon, task) / 2, T, ticks.A, ticks.B, ticks.f, rest, every,
+        spread, instant, reach, chord * _pace(plant),
     )  # fmt: skip
 
 
@@ -212,8 +223,10 @@ def _all_rows(rows: _Rows, plan: Plan, way: _Way, force: Array, F: Array, D: Arr
 class _Rows:
     """Rows of a program as they are made."""
 
-    def __init__(self, flow: _Flow, H: int, flows: Array, drives: Array, chord: float, slack: float) -> None:
-        self.slack = slack
+    def __init__(
+        self, flow: _Flow, H: int, flows: Array, drives: Array, chord: float, slack: float, order: Order, nearby: float
+    ) -> None:
+        self.slack, self.order, self.nearby = slack, order, nearby
         self.flow, self.H, self.flows, self.drives, self.chord = flow, H, flows, drives, chord
         self.parts: list[tuple[Array, ...]] = []
         self.count = 0
@@ -237,20 +250,39 @@ class _Rows:
         along = self.chord * (n @ plant.B[n_s : 2 * n_s])
         need = both_ends(np.maximum(planned @ leaves.T + along @ inputs, 0.0)[None])[0]  # (parts + 1, nodes)
         worst = both_ends((most @ leaves.T + np.abs(along) @ largest)[None])[0]
-        kept = free + moved - worst < np.abs(Y[:, near]) @ box
-        i, j = np.nonzero(kept)
-        last = plant.parts - 1
+        reached = free + moved - worst < np.abs(Y[:, near]) @ box
+        if not reached.any():
+            return
+        reach, whole = self.reach(box, planned, most)
+        left = free + moved
+        allowed = GIVEN * np.maximum(left.min(axis=1), 0.0)
+        thin = thinned(self.order, left, Y[:, near[n_s:]], reach, whole, allowed)
+        at_most = thin.least + np.einsum("iak,ik->ia", thin.spread, whole - reach)
+        reached = (left - worst)[:, thin.nodes] - at_most < (np.abs(Y[:, near]) @ box)[thin.nodes]
+        i, a = np.nonzero(thin.stays & reached)
+        j, last = thin.nodes[a], plant.parts - 1
         self._add(
             np.einsum("mn,mnr->mr", Y[j], self.flows[i]), np.einsum("mn,mns->ms", Y[j], self.drives[i]),
-            free[i, j] - ROOM * need[i, j] - self.slack, free[i, j], np.full(len(i), o),
+            free[i, j] - ROOM * need[i, j] - thin.least[i, a] - self.slack, free[i, j] - thin.least[i, a],
+            np.full(len(i), o),
             np.column_stack([np.maximum(i - 1, 0), np.minimum(i, last)]),
-            leaves[j], np.broadcast_to(along, (len(i), n_s)),
+            leaves[j], np.broadcast_to(along, (len(i), n_s)), thin.spread[i, a], i,
         )  # fmt: skip
+
+    def reach(self, box: Array, planned: Array, most: Array) -> tuple[Array, Array]:
+        """Nearby and largest z of :mod:`softgrasp.lqr.constrained.thin` in an interval, (parts + 1, k).
+
+        ``box``: of hand and modes, (n_s + k,); ``planned``, ``most``: swings, (parts, k).
+        """
+        plant, share = self.flow.plant, self.nearby
+        modes, unit = box[plant.n_s :], self.chord * _pace(plant)
+        swung = both_ends(np.stack([unit * (planned + share * (most - planned)), unit * most]))
+        return share * modes + swung[0], modes + swung[1]
 
     def limits(self, force: Array, limits: Limits, u_bar: Array, F: Array, D: Array) -> None:
         """Rows of force, speed and jump in an interval."""
         plant, flow = self.flow.plant, self.flow
-        n_s, K = plant.n_s, flow.wide(plant.K)
+        n_s, k, K = plant.n_s, len(plant.tissue.omega), flow.wide(plant.K)
         sides: list[tuple[Array, Array, Array, Array]] = [(K, plant.L, force + u_bar, force - u_bar)]
         if limits.speed is not None:
             v, most = slice(n_s, 2 * n_s), np.full(n_s, limits.speed)
@@ -263,7 +295,7 @@ class _Rows:
             for sign, free in ((1.0, below), (-1.0, above)):
                 self._add(
                     sign * a, sign * d, free, free, np.full(n_s, HARD), np.zeros((n_s, 2), dtype=np.int64),
-                    np.zeros((n_s, len(plant.tissue.omega))), np.zeros((n_s, n_s)),
+                    np.zeros((n_s, k)), np.zeros((n_s, n_s)), np.zeros((n_s, k)), np.zeros(n_s, dtype=np.int64),
                 )  # fmt: skip
 
     def arrays(self) -> list[Any]:

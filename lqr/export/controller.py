@@ -109,6 +109,7 @@ def plan_arrays(controller: Controller, own: Program) -> tuple[dict[str, int | s
         "PLAN_WAY": own.way, "PLAN_WAY_C": own.way_c, "PLAN_BOX": own.box,
         "PLAN_TAIL": np.stack([own.tail_real.T, own.tail_imag.T]), "PLAN_SEES": own.seen.T, "PLAN_TUBE": own.tube,
         "PLAN_START": own.start, "PLAN_BEGIN": own.c, "PLAN_T": own.T.T, "PLAN_REST": own.rest,
+        "PLAN_SPREAD": own.spread, "PLAN_INSTANT": own.instant, "PLAN_REACH": own.reach, "PLAN_BETWEEN": own.between,
     }  # fmt: skip
     return sizes, arrays
 

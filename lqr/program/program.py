@@ -65,6 +65,11 @@ class Program:
     f: Array  # of the constant load, (N,)
     rest: Array  # state of the controller at the start of the plan, (N,)
     every: int  # ticks of an interval
+    spread: Array  # what a row keeps for others by a unit of the modes beyond ``reach``, (m, k)
+    instant: NDArray[np.int64]  # of a gap, (m,)
+    reach: Array  # modes off the way that was planned first, with their swings between two instants, for which every
+    # row keeps what others need, (H + 1, parts + 1, k)
+    between: Array  # what a unit of each swing counts in it, (k,)
 
     @property
     def H(self) -> int:
@@ -88,6 +93,11 @@ class Program:
     @classmethod
     def of(cls, arrays: dict[str, Array]) -> Program:
         """From :meth:`arrays`. Raises KeyError: one is missing."""
+        if "spread" not in arrays:  # saved when every row stood for itself alone
+            most, leaves = arrays["most"], arrays["leaves"]
+            none = {"spread": np.zeros_like(leaves), "instant": np.zeros(len(leaves), dtype=np.int64)}
+            reach = np.zeros((len(most), most.shape[1] + 1, most.shape[2]))
+            arrays = arrays | none | {"reach": reach, "between": np.zeros(most.shape[2])}
         values: dict[str, Any] = {field.name: arrays[field.name] for field in fields(cls)}
         return cls(**values | {"price": float(values["price"]), "every": int(values["every"])})
 
@@ -163,6 +173,9 @@ class Program:
                 (self.leaves[own] * swings[pairs[:, 1]]).sum(axis=1),
             )
             bend = np.maximum(bend + self.along[own] @ (self.K @ x + self.L @ now), 0.0)
+            swung = np.maximum(swings[[0, *range(len(swings))]], swings[[*range(len(swings)), -1]])
+            beyond = np.maximum(np.abs(off[:, self.n_s :]) + self.between * swung - self.reach[j], 0.0)
+            bend += (self.spread[own] * beyond[self.instant[own]]).sum(axis=1)
             left = self.a[own] @ x + self.coefficients[own, -self.n_s :] @ now + self.exact[own] - bend
             soft = self.obstacle[own] != HARD
             if not (left[~soft] >= -KEEPS).all():

@@ -79,7 +79,14 @@ static void make_rows(sg_plan *p) {
         for (int r = PLAN_FIRST[own]; r < PLAN_FIRST[own + 1]; ++r) {
             double one = dot(PLAN_LEAVES[r], PLAN_MOST[own][PLAN_PART[r][0]], PK);
             double other = dot(PLAN_LEAVES[r], PLAN_MOST[own][PLAN_PART[r][1]], PK);
-            p->bend[r] = (1 + KEEPS) * (one > other ? one : other);
+            p->bend[r] = one > other ? one : other;
+            for (int m = 0; m < PK; ++m) {
+                double most = 0;
+                for (int i = 0; i < PP; ++i)
+                    if (PLAN_MOST[own][i][m] > most) most = PLAN_MOST[own][i][m];
+                p->bend[r] += PLAN_SPREAD[r][m] * (PLAN_BOX[own][M + m] + PLAN_BETWEEN[m] * most);
+            }
+            p->bend[r] *= 1 + KEEPS;
         }
 }
 
@@ -288,7 +295,7 @@ static int solve_program(sg_plan *p, const int *rows, int count, int soft) {
 
 /* Whether the plan c from x is certain to keep every gap and limit for ever. */
 static int judge_plan(sg_plan *p, long interval, const double *begin, const double *c) {
-    double x[PN], off[PN], swings[PP][PK], sum = 0;
+    double x[PN], off[PN], swings[PP][PK], beyond[PP + 1][PK], sum = 0;
     for (int i = 0; i < PN; ++i) x[i] = begin[i];
     for (int k = 0; k < PH; ++k, c += M) {
         int own = kind_of(interval + k), first = PLAN_FIRST[own], rows = PLAN_FIRST[own + 1] - first;
@@ -301,6 +308,7 @@ static int judge_plan(sg_plan *p, long interval, const double *begin, const doub
             apply_columns(&PLAN_NEAR_C[i][0][0], NEAR, at_way, M, near, NEAR);
             for (int j = 0; j < NEAR; ++j)
                 if (!(size(near[j]) <= PLAN_BOX[own][j])) return 0;
+            for (int m = 0; m < PK; ++m) beyond[i][m] = size(near[M + m]) - PLAN_REACH[own][i][m];
         }
         for (int i = 0; i < PP; ++i) {
             double pairs[2 * PK] = {0};
@@ -312,6 +320,12 @@ static int judge_plan(sg_plan *p, long interval, const double *begin, const doub
                 if (!(swings[i][m] <= PLAN_MOST[own][i][m])) return 0;
             }
         }
+        for (int i = 0; i <= PP; ++i)
+            for (int m = 0; m < PK; ++m) {
+                double a = swings[i > 0 ? i - 1 : 0][m], b = swings[i < PP ? i : PP - 1][m];
+                beyond[i][m] += PLAN_BETWEEN[m] * (a > b ? a : b);
+                if (!(beyond[i][m] > 0)) beyond[i][m] = 0;
+            }
         apply_columns(&PLAN_K[0][0], M, x, PN, u, M);
         apply_columns(&PLAN_L[0][0], M, c, M, u, M);
         if (p->whole) { /* the rows of the program, with more room */
@@ -333,7 +347,8 @@ static int judge_plan(sg_plan *p, long interval, const double *begin, const doub
             double one = dot(PLAN_LEAVES[r], swings[PLAN_PART[r][0]], PK);
             double other = dot(PLAN_LEAVES[r], swings[PLAN_PART[r][1]], PK), bend = one > other ? one : other;
             bend += dot(PLAN_ALONG[r], u, M);
-            if (!(left[i] - (bend > 0 ? bend : 0) >= 0)) return 0;
+            bend = (bend > 0 ? bend : 0) + dot(PLAN_SPREAD[r], beyond[PLAN_INSTANT[r]], PK);
+            if (!(left[i] - bend >= 0)) return 0;
         }
         along_way(x, c);
     }

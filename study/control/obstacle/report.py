@@ -165,8 +165,8 @@ def _noisy(study: PlannedStudy) -> list[tuple[str, str]]:
         ("least gap of that run", f"{online.gaps.min():.3g} m, {'with' if noisy else 'without'} noise"),
         (
             "program online",
-            f"{program.count(0)} rows of {study.rows} can become active, {np.median(seconds):.2g} ms in the median and "
-            f"{seconds.max():.2g} ms at most in Python, with the check of the plan",
+            f"{program.count(0)} of {study.rows} rows, which imply all that can become active; "
+            f"{np.median(seconds):.2g} ms in the median and {seconds.max():.2g} ms at most in Python, with its check",
         ),
     ]
 

@@ -1,0 +1,125 @@
+"""Rows of a program that others imply: a node between others moves nearly as they do.
+
+All nodes hear the hand alike. In the half-space of one interval node j keeps, with means of others of weights w_a >= 0
+and sum 1, and n.S_j its row of the modes,
+
+    left_j >= sum_a w_a left_a - d_j - c_j.z,    d_j = sum_a w_a v_a - v_j,    c_j = |n.(S_j - sum_a w_a S_a)|,
+
+v the gaps of the first plan, and z how far the modes are from it, with what their swings add between two instants. The
+rows that stay keep max(0, d_j + c_j.r) for all that they stand for, with r what z is near to the first plan, and where
+a plan is judged what z has beyond r, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softgrasp.fem.petsc import Array
+
+NEAREST = 6  # earlier nodes among which those about a node are sought
+ROOM = 32  # nodes that stay, for which there is room at first, and more each time
+BESIDE = 1e-9  # of the extent: a node so near to a mean of others lies there
+
+
+@dataclass(frozen=True)
+class Order:
+    """Nodes of a surface from coarse to fine, each with means of earlier ones that stand for it."""
+
+    nodes: NDArray[np.int64]  # all, coarse ones first, (nodes,)
+    about: tuple[NDArray[np.int64], ...]  # of each in this order, earlier nodes, (<= d,)
+    means: tuple[Array, ...]  # weights of these, the mean nearest to the node, then each alone, (means, <= d)
+
+
+@dataclass(frozen=True)
+class Thinned:
+    """Nodes whose rows stay in a half-space, and what they keep for the others."""
+
+    nodes: NDArray[np.int64]  # those that stay at some instant, (some,)
+    stays: NDArray[np.bool_]  # where they do, (parts + 1, some)
+    least: Array  # what every row keeps while z is at most r, (parts + 1, some) [m]
+    spread: Array  # what it keeps more for a unit of z beyond that, (parts + 1, some, k)
+
+
+def coarse_to_fine(places: Array) -> Order:
+    """An order in which every node is the one farthest from all before it.
+
+    ``places``: (nodes, d) [m].
+    """
+    count, extent = len(places), float(np.ptp(places, axis=0).max()) or 1.0
+    nodes, about, means = list[int](), list[NDArray[np.int64]](), list[Array]()
+    off = np.linalg.norm(places - places.mean(axis=0), axis=1)
+    for _ in range(count):
+        node = int(np.argmax(np.round(off / extent, 9)))  # the first of equal ones
+        apart = np.linalg.norm(places[nodes] - places[node], axis=1)
+        near = np.array(nodes, dtype=np.int64)[np.argsort(np.round(apart / extent, 9), kind="stable")[:NEAREST]]
+        some, weights = _nearest_mean(places, node, near, BESIDE * extent)
+        about.append(some)
+        means.append(np.vstack([weights, np.eye(len(some))]) if nodes else np.zeros((0, 0)))
+        apart = np.linalg.norm(places - places[node], axis=1)
+        off = np.minimum(off, apart) if nodes else apart
+        nodes.append(node)
+        off[nodes] = -1.0
+    return Order(np.array(nodes), tuple(about), tuple(means))
+
+
+def _nearest_mean(places: Array, node: int, near: NDArray[np.int64], same: float) -> tuple[NDArray[np.int64], Array]:
+    """Of at most d nodes, the closest ones, those whose mean comes nearest to a node, and its weights."""
+    least, some, weights = np.inf, near[:1], np.ones(min(1, len(near)))
+    for size in range(1, min(places.shape[1], len(near)) + 1):
+        for chosen in combinations(range(len(near)), size):
+            corners = places[near[list(chosen)]]
+            edges, off = (corners[1:] - corners[0]).T, places[node] - corners[0]
+            inner = np.linalg.lstsq(edges, off, rcond=None)[0]
+            w = np.append(1 - inner.sum(), inner)
+            distance = max(float(np.linalg.norm(off - edges @ inner)), same)
+            if (w >= 0).all() and distance < (1 - 1e-6) * least:
+                least, some, weights = distance, near[list(chosen)], w
+    return some, weights
+
+
+def thinned(order: Order, v: Array, seen: Array, reach: Array, whole: Array, most: Array) -> Thinned:
+    """The nodes whose rows stay.
+
+    Args:
+        v: gaps of the first plan at every instant, (parts + 1, nodes) [m].
+        seen: n.S_j, (nodes, k).
+        reach: r, (parts + 1, k).
+        whole: the largest z of a plan that can be taken, (parts + 1, k).
+        most: what a row may keep for others at every instant, (parts + 1,) [m].
+    """
+    instants, count = v.shape
+    found: list[int] = []
+    mean = np.zeros((instants, count, 0))  # of every node, by those found
+    least, spread = np.zeros((instants, 0)), np.zeros((instants, 0, seen.shape[1]))
+    for j, about, means in zip(order.nodes.tolist(), order.about, order.means, strict=True):
+        w = np.einsum("mp,ipa->ima", means, mean[:, about, : len(found)])
+        d = np.einsum("ima,ia->im", w, v[:, found]) - v[:, j, None]
+        c = np.abs(seen[j] - w @ seen[found])
+        near, far = (d + np.einsum("imk,ik->im", c, z) for z in (reach, whole))
+        none = np.full((instants, 1), np.inf)
+        needs = np.hstack([np.maximum(near, 0.0), none])
+        best = np.argmin(needs, axis=1)
+        stays = needs[np.arange(instants), best] > most
+        if stays.any():
+            if len(found) == mean.shape[2]:
+                mean, least, spread = (
+                    np.pad(x, [(0, ROOM if axis == at else 0) for axis in range(x.ndim)])
+                    for x, at in ((mean, 2), (least, 1), (spread, 1))
+                )
+            mean[stays, j, len(found)] = 1.0
+            found.append(j)
+        for i in np.flatnonzero(~stays).tolist():
+            m = int(best[i])
+            mean[i, j, : w.shape[2]] = w[i, m]
+            stand = np.flatnonzero(w[i, m])
+            least[i, stand] = np.maximum(least[i, stand], near[i, m])
+            # max(0, d + c.z), which is convex, where it begins behind r: its chord
+            behind = near[i, m] < 0
+            share = max(far[i, m], 0.0) / (far[i, m] - near[i, m]) if behind else 1.0
+            spread[i, stand] = np.maximum(spread[i, stand], share * c[i, m])
+    some, every = len(found), np.array(found, dtype=np.int64)
+    return Thinned(every, mean[:, every, np.arange(some)] == 1.0, least[:, :some], spread[:, :some])
