@@ -68,6 +68,11 @@ class Plan:
         """Why it is not certified; empty where it is."""
         if self.slack.max(initial=0.0) > 0 and not self.gap >= 0:
             return f"the body is inside clearance and margin for {self.outside:.4g} s, {self.depth:.3g} m at most"
+        if not self.gap >= 0 and self.unsafe:
+            return (
+                f"within the horizon of {self.horizon.steps} intervals, or in the {self.unsafe} behind it, the body "
+                f"may come {-self.gap:.2g} m nearer than the clearance"
+            )
         if not self.gap >= 0:
             return f"between two instants the body may come {-self.gap:.2g} m nearer than the clearance"
         if not self.task.bounded:
@@ -135,7 +140,8 @@ def make_plan(plant: HeldPlant, task: Task, steps: int, longest: int | None = No
             raise ControlError("the steady force at the target is not below its limit; raise control.constraints.force")
         _check_memory(plant, task, steps)
         plan = _cheapest(Horizon(plant, steps), task, level)
-        if not plan.unsafe or steps >= longest:
+        # where the longest plan ends before what follows is safe, a plan that keeps no gap is not worth its time
+        if not plan.unsafe or steps >= longest or (plan.gap < 0 and steps + plan.unsafe > longest):
             return plan
         steps = min(longest, steps + plan.unsafe)
 

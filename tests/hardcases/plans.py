@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -85,6 +86,8 @@ def slit(room: float) -> str:
     return f"obstacle=[{left}, {right}]"
 
 
+SAGGING = ("motion.target=[5.0, 0.0]", "effects.gravity=[0, -0.1]", "time.start='equilibrium'")
+"""Hanging tissue, 1.1 mm at most below where it would be without weight."""
 UPWARDS = ("motion.target=[0.0, 3.0]", "control.constraints.margin=1e-3", "control.constraints.horizon=20")
 
 
@@ -136,8 +139,16 @@ PLANS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("body that sags by its weight", (
         f"obstacle=[{WALL}]", "effects.gravity=[0, -0.1]", "time.start='equilibrium'",
     ), 0.0),
+    ("floor between the body and its sag", (
+        *SAGGING, "obstacle=[{kind='halfspace', normal=[0, 1], offset=-1e-3}]",), None),
+    ("floor 5 mm below its sag", (*SAGGING, "obstacle=[{kind='halfspace', normal=[0, 1], offset=-6e-3}]"), 0.0),
+    ("disc that crosses the way", (
+        "obstacle=[{kind='disc', center=[4.5, -1.5], radius=0.7, path={velocity=[0, 0.3]}}]",), 0.0),
+    ("disc that runs through the body, faster than it", (
+        "obstacle=[{kind='disc', center=[0.5, -1.5], radius=0.7, path={velocity=[0, 3]}}]",), 1.157),
     ("slit of two discs, a micrometre narrower than body and margins", (slit(0.999e-3), *UPWARDS), None),
     ("slit of two discs, a micrometre wider", (slit(1.001e-3), *UPWARDS), 0.0),
+    ("the same with a horizon that is found", (slit(1.001e-3), *UPWARDS[:2]), 0.0),
 )  # fmt: skip
 
 
@@ -147,7 +158,9 @@ def plan_rows(quick: bool) -> Iterator[HardCase]:
         if quick and number % 2:
             continue
         reason = (
-            "every gap is kept at every step" if not bound else "the depth of the start, and no more than 1 % of it"
+            "every gap is kept at every step"
+            if not bound
+            else "the depth that no force within the limits avoids, and no more than 1 % of it"
         )
         if bound is None:
             reason = "there is no room, or no bound of what the reduced plant leaves out"
@@ -193,6 +206,35 @@ def slower_naive(table: str, *changes: str) -> float:
     return min(1.0, max(0.0, 1 - rate / found.judged.abscissa_known))
 
 
+def unmeasured(*, skipped: bool = True) -> float:
+    """Largest share by which 3 s of the full loop change where two samples are NaN for the second of them."""
+    found = observed(MARKERS)
+    runs = []
+    for lost in (False, True):
+        own, ticks = (
+            replace(found.controller, x_bar=0 * found.controller.x_bar, u_bar=0 * found.controller.u_bar),
+            found.ticks,
+        )
+        filter_, x = own.observer, np.zeros(len(ticks.A))
+        assert filter_ is not None
+        x[4], estimate, way = 1.0, np.zeros(own.plant.N), []  # the slowest mode, of which the filter knows nothing
+        own.reset()
+        for tick in range(round(3 / own.period)):
+            y = ticks.C @ x
+            if lost and 1 <= tick * own.period < 2:
+                y[-2:] = np.nan
+            if skipped:
+                u = own.step(y[:2], np.zeros(2), y[2:])
+            else:
+                estimate = estimate + filter_.M @ (y - filter_.C @ estimate)
+                u = own.K @ estimate
+                estimate = filter_.A @ estimate + filter_.B @ u
+            x = ticks.A @ x + ticks.B @ u
+            way.append(x[:2])
+        runs.append(np.array(way))
+    return float(np.abs(runs[1] - runs[0]).max() / np.abs(runs[0]).max())
+
+
 OBSERVERS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("four markers, Q = 1e6", (MARKERS, "control.Q=1e6"), 0.02),
     ("four markers", (MARKERS,), 0.02),
@@ -217,6 +259,9 @@ def observer_rows(quick: bool) -> Iterator[HardCase]:
             continue
         reason = "there is nothing to estimate with" if bound is None else "the gain sets the pace, not the estimate"
         yield HardCase(name, number + 1.0, here(slower, *arguments), textbook(slower_naive, *arguments), bound, reason)
+    naive, reason = textbook(lambda: unmeasured(skipped=False)), "the other samples, and the model, show what it would"
+    name = "a marker that is NaN for 1 s"
+    yield HardCase(name, len(OBSERVERS) + 1.0, here(lambda *_: unmeasured()), naive, 0.02, reason)
 
 
 FAMILIES = (

@@ -190,3 +190,11 @@ def test_nothing_is_called_and_a_million_ticks_pass(tmp_path: Path) -> None:
     done: Any = make(tmp_path, "time")
     assert done.returncode == 0, done.stderr
     assert re.search(r"N = \d+: a tick takes .*; 0 held", done.stdout)
+
+
+def test_arithmetic_that_removes_tests_for_nan_is_refused(tmp_path: Path) -> None:
+    write_controller(controller("plain"), tmp_path)
+    for flag in ("-Ofast", "-ffast-math"):
+        made = subprocess.run(["cc", flag, "-c", "controller.c"], cwd=tmp_path, capture_output=True, text=True)
+        assert made.returncode != 0
+        assert "compile without -ffast-math" in made.stderr
