@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -78,8 +78,8 @@ def save(model: ReducedModel | StrainModel | TurningModel | ContactModel, path: 
     Folders are created.
 
     Raises:
-        OSError: the folder cannot be made, or nothing may be written there.
-        ResourceError: the disk is full; what was there before stays.
+        ResourceError: the folder cannot be made, nothing may be written there, or the disk is full; what was there
+            before stays.
     """
     if isinstance(model, ContactModel):
         whole = None if model.V is None or model.layout is None else (model.layout, model.V, model.V[:, :0])
@@ -214,14 +214,15 @@ def write_model(
 
     Collective with a reconstruction, whose rows every rank adds in turn; ``small`` writes the arrays.
 
-    Raises OSError, ResourceError: as :func:`save`.
+    Raises ResourceError: as :func:`save`.
     """
     comm = MPI.COMM_SELF if reconstruction is None else reconstruction.layout.comm
     unfinished = path.with_name(path.name + ".part")
     try:
         with raise_on_all_ranks(comm):
             if comm.rank == 0:
-                path.parent.mkdir(parents=True, exist_ok=True)
+                with _named(path):
+                    path.parent.mkdir(parents=True, exist_ok=True)
                 note(unfinished, path)
                 # written by Python: HDF5 ends the program on a full disk
                 with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
@@ -245,7 +246,8 @@ def write_model(
                 unfinished.replace(path)
     finally:  # of a file that was not written whole
         if comm.rank == 0:
-            unfinished.unlink(missing_ok=True)
+            with suppress(OSError):  # its folder may be none
+                unfinished.unlink()
 
 
 @contextmanager
@@ -254,7 +256,9 @@ def _named(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ResourceError(f"{path} cannot be written ({error.strerror or error}); free the disk") from error
+        raise ResourceError(
+            f"{path} cannot be written ({error.strerror or error}); free the disk or name another file"
+        ) from error
 
 
 @contextmanager

@@ -212,7 +212,7 @@ def rigid_modes(points: Floats, dimension: int, rotation: bool, reference: npt.A
 def cells_in(tissue: TissueMesh, layer: Any) -> Ints:
     """Owned cells with the layer's ``tag``, or with their midpoint in its ``box``; sorted, maybe empty here.
 
-    Raises SceneError: the layer has a tag that the mesh does not have, or it has neither tag nor box.
+    Raises SceneError: the layer has a tag that the mesh does not have.
     """
     owned = np.arange(tissue.owned, dtype=np.int32)
     midpoints = dolfinx.mesh.compute_midpoints(tissue.mesh, tissue.dimension, owned)[:, : tissue.dimension]
@@ -226,8 +226,7 @@ def cells_in(tissue: TissueMesh, layer: Any) -> Ints:
             )
         cells = tissue.cell_tags.indices[np.isin(tissue.cell_tags.values, tissue.cell_sets[layer.tag])]
         return np.asarray(np.sort(cells[cells < len(owned)]), dtype=np.int32)
-    if layer.box is None:
-        raise SceneError("A layer has neither tag nor box: give one of them.")
+    assert layer.box is not None  # a layer has the one or the other
     # The tolerance must not depend on the rank: lengths of the layer's own box, not of the local mesh.
     tolerance = BOX_TOLERANCE * float(np.max(np.ptp(np.asarray(layer.box, dtype=np.float64), axis=0)))
     return np.flatnonzero(_inside(midpoints, layer.box, tolerance, "box of a layer")).astype(np.int32)

@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
-from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, combine, total
 from softgrasp.fem.solve.replicated import replicated_operators
 from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
@@ -187,8 +186,8 @@ class TissueMidpoint:
         """The damping matrix with its mass-proportional part, so that a step needs one product with it. Collective."""
         self.y = self.k.duplicate()
         self.y_array = self.y.array_r
-        if self.operators.D is None or self.operators.M is None:
-            raise SolverError("a damping matrix is missing")
+        assert self.operators.D is not None
+        assert self.operators.M is not None
         self.M, self.D = self.operators.M, self.operators.D.copy()
         self.D.axpy(self.alpha, self.M, SAME)
         self._propagate = self._general

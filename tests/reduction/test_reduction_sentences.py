@@ -1,0 +1,109 @@
+"""Sentences of `reduction` that no other test asks for: the call with the bad input, and what it is told."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+
+import softgrasp as sg
+from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.reduction.bases.engines import factor
+from softgrasp.reduction.bases.pod import cholesky_of
+from softgrasp.reduction.bases.truncation import Truncation
+from softgrasp.reduction.certified.trainer import Trainer
+from softgrasp.reduction.identify.posterior import check_posterior
+from softgrasp.reduction.identify.unknowns import parse_unknowns
+from softgrasp.reduction.online import prepared
+from softgrasp.reduction.strain.nnls import nnls
+
+pytestmark = pytest.mark.serial
+Act = Callable[[Path, pytest.MonkeyPatch], Any]
+
+
+def model(*keys: str, **given: Any) -> sg.Model:
+    return sg.build(
+        "paper_forward", ["tissue.cells=[2, 4]", "time.steps=4", "output.snapshots='memory'", *keys], **given
+    )
+
+
+@cache
+def made() -> tuple[sg.Model, Trajectory, Any]:
+    """A scene, its run, and a reduced model of it."""
+    full = model()
+    run = sg.simulate(full)
+    return full, run, sg.reduce(full, run, "craig_bampton", 8)
+
+
+def rom() -> Any:
+    return made()[2]
+
+
+def own() -> sg.Model:
+    def W(F: Any, p: Any) -> Any:
+        return p.a * (ufl.tr(F.T * F) - 2 - 2 * ufl.ln(ufl.det(F)) + (ufl.det(F) - 1) ** 2)
+
+    return model("tissue.parameters={a=1.0}", energy=W)
+
+
+def damaged(folder: Path, _: Any) -> Any:
+    sg.save(rom(), folder / "a.h5")
+    with h5py.File(folder / "a.h5", "r+") as file:
+        file["outputs/C_s"][...] += 7.0
+    return sg.load(folder / "a.h5")
+
+
+def below_a_file(folder: Path) -> Path:
+    (folder / "file").write_text("")
+    return folder / "file" / "folder" / "a.h5"
+
+
+def basis(name: str, **how: Any) -> Act:
+    return lambda *_: sg.reduce(*made()[:2], name, 8, **how)
+
+
+SENTENCES: list[tuple[Act, str]] = [
+    (lambda folder, _: sg.save(rom(), below_a_file(folder)), "a.h5 cannot be written (Not a directory); "),
+    (damaged, "a.h5 is damaged: it is not what was written; reduce the scene again"),
+    (lambda *_: factor(MPI.COMM_SELF, np.eye(2), "fast"), "engine 'fast' is unknown; choose one of "),  # type: ignore[arg-type]
+    (lambda *_: cholesky_of(MPI.COMM_SELF, -np.eye(2)), "the inner product is not positive definite on the snapshots"),
+    (basis("best"), "basis 'best' is unknown; choose one of "),
+    (basis("global_pod", inner="heat"), "inner product 'heat' is unknown; choose one of "),
+    (lambda *_: Truncation(), "give exactly one of N, energy and tol"),
+    (lambda *_: Truncation(tol=2.0), "tol = 2.0 must lie between 0 and 1"),
+    (lambda *_: Truncation(N=0), "N = 0 must be at least 1"),
+    (lambda *_: check_posterior(1), "--posterior 1: give at least "),
+    (lambda *_: nnls(np.eye(2), np.ones(2), 2.0), "tau = 2 must lie between 1e-06 and 1"),
+    (lambda *_: Trainer(model(terms=[sg.Term("bed", lambda u, v: ufl.inner(u, v) * ufl.ds, 1.0)])),
+     "own terms have no certificate: their share of the stiffness has no known sign; drop them"),
+    (lambda *_: Trainer(model("effects.finite_strain={law='neo-hooke'}")), "its bound needs linear tissue"),
+    (lambda *_: sg.identify(own(), [], "mu", 1e-3), "identify fits lambda, mu, rho and beta, and cannot go with "),
+    (lambda *_: sg.suggest_markers(own(), "mu", 1e-3, 1),
+     "markers are chosen for lambda, mu, rho and beta; leave out "),
+    (lambda *_: sg.suggest_markers(model("effects.finite_strain={law='neo-hooke'}"), "mu", 1e-3, 1),
+     "markers are chosen by linear elasticity, and effects.finite_strain is on; take "),
+    (lambda *_: parse_unknowns(["beta"], model("effects.damping=false")), "--fit beta: beta needs effects.damping; "),
+    (lambda *_: parse_unknowns(["lambda"], model("tissue.material={lambda=0.0, mu=1.0, rho=1.0}")),
+     "--fit lambda: the scene's value is 0; the fit starts there and needs one > 0"),
+    (lambda *_: rom().at(()), "0 materials are given; the model has 1 layers"),
+    (lambda *_: prepared(rom().at(), None, True), "give the time step dt [s]"),
+    (lambda *_: sg.gradient(rom(), lambda y: 0.0), "the gradient of a reduced model needs the step dt [s]"),
+    (lambda *_: sg.reduce(model(), sg.simulate(model("output.snapshots='none'")), "global_pod"),
+     "output.snapshots must be 'memory' for a reduction; bases are built from the states in memory"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("act", "sentence"), SENTENCES, ids=[sentence[:40] for _, sentence in SENTENCES])
+def test_sentence_names_what_is_wrong(act: Act, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SoftgraspError, match=re.escape(sentence)) as caught:
+        act(tmp_path, monkeypatch)
+    assert "\n" not in str(caught.value).strip()
