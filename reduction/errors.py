@@ -20,6 +20,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.shown import Card, Shown, percent
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.model import ReducedModel
@@ -36,8 +37,8 @@ p_s = M_hand v_s, or [z, v_z] alone."""
 VIEWS: tuple[View, ...] = get_args(View)
 
 
-@dataclass(frozen=True)
-class ModelErrors:
+@dataclass(frozen=True, repr=False)
+class ModelErrors(Shown):
     """Relative errors of a reduced run against snapshots of the full one, dimensionless."""
 
     error: float
@@ -48,6 +49,16 @@ class ModelErrors:
     """|X - X_r|_F / |X|_F of X = [z, v_z], relative to the rigid motion of the hand."""
     error_energy: float
     """Error max_t |H_r - H| / max_t H of the tissue's energy relative to the hand."""
+
+    def card(self) -> Card:
+        """The four in percent, named by what they are errors of."""
+        rows = (
+            ("displacements and velocities", percent(self.error)),
+            ("displacements and momenta", percent(self.error_canonical)),
+            ("deformation and its rate", percent(self.error_deformation)),
+            ("energy of the tissue", percent(self.error_energy)),
+        )
+        return Card("Relative errors of a reduced run", rows)
 
 
 def full_energy(system: BlockSystem, Z: Array) -> Array:

@@ -68,6 +68,9 @@ def test_cards_hold_the_numbers_of_the_objects(objects: dict[str, Any]) -> None:
         np.linalg.solve(objects["system"].E, objects["system"].A)[4:, 4:]
     )  # without the free hand
     assert f"spectral abscissa {poles.real.max():.3g} 1/s" in repr(objects["system"])
+    assert dict(objects["controller"].card().rows)["hand at rest"] == "5 m, 3 m"
+    error = sg.errors(objects["rom"], objects["replay"], objects["model"], objects["run"])
+    assert dict(error.card().rows)["deformation and its rate"] == percent(error.error_deformation)  # type: ignore[union-attr]
 
 
 def test_units_and_labels_of_a_run(objects: dict[str, Any]) -> None:
@@ -137,6 +140,9 @@ def test_a_sweep_from_python_is_the_runs_one_by_one() -> None:
         lag = abs(run.outputs - run.outputs_rigid).max(axis=0)[0]
         assert point.numbers["tip_x lag [m]"] == pytest.approx(lag, rel=1e-12)  # matrices summed, not assembled
     assert list(table.to_pandas()["tissue.material.mu"]) == [20.0, 500.0]
+    data = table.to_xarray()["tip_x lag"]
+    assert data.sel({"tissue.material.mu": 500.0}).item() == table.points[1].numbers["tip_x lag [m]"]
+    assert (data.attrs["units"], data["tissue.material.mu"].attrs["units"]) == ("m", "Pa")
     assert "2, of them 0 refused" in repr(table)
     with pytest.raises(SceneError, match=r"tissue\.material\.nu is not a key"):
         sg.sweep("paper_forward", {"tissue.material.nu": [0.3]})

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.checksums import write_arrays
+from softgrasp.fem.columns import hand_of
 from softgrasp.fem.errors import no_pipe, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.owned import note
@@ -100,11 +101,13 @@ class Controller(Shown):
 
     def card(self) -> Card:
         """Dimension, rate, limits and target."""
+        hand = hand_of(len(self.u_bar), self.plant.names)
+        limits = () if self.limits is None else (amount(x, c.load_unit) for x, c in zip(self.limits, hand, strict=True))
         rows = (
             ("dimension", f"N = {self.plant.N}, {counted(len(self.u_bar), 'input')}"),
             ("rate", f"{1 / self.period:.4g} Hz"),
-            ("limits", "none" if self.limits is None else listed(amount(x) for x in self.limits)),
-            ("hand at rest", listed(amount(x) for x in self.x_bar[: len(self.u_bar)])),
+            ("limits", listed(limits)),
+            ("hand at rest", listed(amount(x, c.unit) for x, c in zip(self.x_bar, hand, strict=False))),
         )
         return Card("Controller u = u_bar + K (x - x_bar)", rows)
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.columns import Columns
+from softgrasp.fem.columns import Columns, hand_of
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.labelled import FullOrderRun
 from softgrasp.fem.petsc import Array, total
@@ -102,11 +102,12 @@ class LoopTrajectory(Shown, FullOrderRun):
 
     def card(self) -> Card:
         """Steps, cost, where the hand ends, saturation."""
+        hand = hand_of(self.q_s.shape[1], self.output_names)
         rows = (
             ("time", f"{counted(len(self.times) - 1, 'step')} to {amount(self.times[-1], 's')}"),
             ("outputs", listed(self.output_names)),
             ("cost", amount(self.cost[-1])),
-            ("hand at the end", listed(amount(x) for x in self.q_s[-1])),
+            ("hand at the end", listed(amount(x, c.unit) for x, c in zip(self.q_s[-1], hand, strict=True))),
             ("steps at a limit", f"{100 * self.saturated:.3g} %"),
         )
         return Card("Trajectory of the closed loop", rows)

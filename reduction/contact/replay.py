@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softgrasp.fem.petsc import total
-from softgrasp.fem.shown import Shown
+from softgrasp.fem.shown import Card, Shown, percent
 from softgrasp.reduction.contact.model import ContactModel, ContactRun
 from softgrasp.reduction.replay import FullRun
 from softgrasp.reduction.system import ModelError
@@ -25,6 +25,14 @@ class ContactErrors(Shown):
     """|Z - V A| / |Z| of the deformation over all nodes and steps [1]."""
     force: float | None
     """|F - F_r| / |F| of the forces of all obstacles over all steps [1]; None where the full run never touches."""
+
+    def card(self) -> Card:
+        """Both in percent."""
+        force = "no contact" if self.force is None else percent(self.force)
+        return Card(
+            "Relative errors of a reduced run with contact",
+            (("deformation", percent(self.z)), ("forces of the obstacles", force)),
+        )
 
 
 def replay_contact(rom: ContactModel, full: FullRun, model: Model | None = None) -> ContactRun:

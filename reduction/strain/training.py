@@ -28,6 +28,7 @@ from mpi4py import MPI
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.petsc import Array, PETSc, on_root, times_columns, total
 from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.shown import Card, Shown, percent
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.bases.inner import Rows, Weight
@@ -55,8 +56,8 @@ ENTRIES = 1 << 26  # of the matrix of their forces, which one rank stores: 512 M
 TAUS = (1e-4, 3e-2)  # least and largest tau chosen from the error of the model on all cells
 
 
-@dataclass(frozen=True)
-class StrainErrors:
+@dataclass(frozen=True, repr=False)
+class StrainErrors(Shown):
     """Relative errors over the snapshots of one full run, or of several, dimensionless."""
 
     z: float
@@ -65,6 +66,15 @@ class StrainErrors:
     """Error |V - Phi A'|_M / |V|_M of its velocity."""
     energy_norm: float
     """Error of (z, v) in the norm (z' K_ee z + v' M_ee v)^(1/2), K_ee at rest."""
+
+    def card(self) -> Card:
+        """The three in percent."""
+        rows = (
+            ("deformation", percent(self.z)),
+            ("its rate", percent(self.v)),
+            ("both, by energy", percent(self.energy_norm)),
+        )
+        return Card("Relative errors of a reduced run at finite strain", rows)
 
 
 @dataclass(frozen=True)

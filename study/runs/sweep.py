@@ -18,7 +18,7 @@ from mpi4py import MPI
 from softgrasp import __version__
 from softgrasp.fem import Model, RunOptions, Scene, Trajectory, adapt, note, remove_own, scene_hash, simulate
 from softgrasp.fem.errors import Interrupted, SceneError, SoftgraspError, shortened
-from softgrasp.fem.labelled import table
+from softgrasp.fem.labelled import package, table
 from softgrasp.fem.scene.file import find_scene, load_scene, unit_of
 from softgrasp.fem.shown import Card, Shown, listed
 from softgrasp.reduction import ReducedModel, errors_linear, full_run, reduce_linear, replay_linear
@@ -246,6 +246,30 @@ class SweepTable(Shown):
     def to_pandas(self) -> Any:
         """One row a point, as ``pandas.DataFrame``. Raises SoftgraspError: pandas is not installed."""
         return table(point.row() for point in self.points)
+
+    def to_xarray(self) -> Any:
+        """A dimension a key, as ``xarray.Dataset``; values that are lists are labels, as "[4, 8]".
+
+        A number is NaN where its point was refused; units are in ``attrs["units"]``.
+
+        Raises SoftgraspError: xarray is not installed.
+        """
+        xarray = package("xarray")
+
+        def mark(value: Any) -> Any:
+            return value if isinstance(value, int | float | str) else str(list(value))
+
+        places = [tuple(mark(value) for value in point.values.values()) for point in self.points]
+        axes = {key: list(dict.fromkeys(at[i] for at in places)) for i, key in enumerate(self.points[0].values)}
+        data = {}
+        for name in dict.fromkeys(name for point in self.points for name in point.numbers):
+            numbers = np.full([len(values) for values in axes.values()], np.nan)
+            for point, place in zip(self.points, places, strict=True):
+                if (number := point.numbers.get(name)) is not None:
+                    numbers[tuple(v.index(x) for v, x in zip(axes.values(), place, strict=True))] = number
+            word, _, unit = name.partition(" [")
+            data[word] = (tuple(axes), numbers, {"units": unit.rstrip("]")} if unit else {})
+        return xarray.Dataset(data, {key: (key, values, {"units": unit_of(key)}) for key, values in axes.items()})
 
 
 def sweep(scene: str | Path, values: Mapping[str, Sequence[float]], *, N: int | None = None) -> SweepTable:
