@@ -35,10 +35,13 @@ softgrasp reduce paper_forward --tolerance 1e-2
 
 [bold]Exit status[/bold]
 
-0: done, also where --until stopped a run. 1: refused or failed, with one sentence.
+0: done, also where --until stopped a run.
 
-2: a wrong option, or a fault of the program. 3: an answer is refused: of query above its
-tolerance, of identify by misfit, mesh, time step, an unseen direction or no convergence."""
+1: refused or failed, with one sentence.
+
+2: a wrong option, or a fault of the program.
+
+3: an answer is refused, of query above its tolerance, of identify with its reason."""
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,

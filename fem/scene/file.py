@@ -38,6 +38,7 @@ _EXPECTED = {
 }
 
 PART = 4  # letters of a part of a name that is recognised
+TABLES = 2  # most tables with a key of one name, for which another table is suggested [1]
 _FORMS = {
     "effects.gravity": "gravity = { g = [0, -9.81] }",
     "effects.damping": 'damping = { kind = "kelvin-voigt", beta = 0.01 }',
@@ -302,8 +303,9 @@ def _suggest(path: Sequence[str]) -> str:
     near = near or [name for name in known if _akin(path[-1], name)]
     if near:
         return f"did you mean {'.'.join([*path[:-1], near[0]])}?"
-    if elsewhere := next((p for p in _below() if _akin(path[-1], p[-1])), None):
-        return f"did you mean {'.'.join(elsewhere)}?"
+    elsewhere = [p for p in _below() if _akin(path[-1], p[-1])]
+    if 0 < len(elsewhere) <= TABLES:
+        return f"did you mean {'.'.join(elsewhere[0])}?"
     return f"keys of {'.'.join(path[:-1]) or 'a scene'} are {', '.join(known)}"
 
 

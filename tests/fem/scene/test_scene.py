@@ -50,6 +50,7 @@ REFUSED: list[tuple[Path, list[str], str]] = [
     (PAPER, ["effects.strain=true"], "effects.strain is not a key; did you mean effects.finite_strain?"),
     (PAPER, ["tissue.material.youngs_modulus=1"], "is not a key; did you mean tissue.material.young?"),
     (PAPER, ["time.gravity_vector=1"], "time.gravity_vector is not a key; did you mean effects.gravity?"),
+    (PAPER, ["motion.kind='csv'"], "motion.kind is not a key; keys of motion are target, "),
     (PAPER, ["mu=1"], "mu is not a key; did you mean tissue.material.mu?"),
     (PAPER, ["tissu.order=1"], "tissu is not a key; did you mean tissue?"),
     (PAPER, ["time.zzz=1"], "time.zzz is not a key; keys of time are steps, end, start, solver, rtol"),
