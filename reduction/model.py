@@ -109,6 +109,21 @@ class ReducedModel(Shown):
         """
         return drawn("model_errors", self, model, run)
 
+    def explore(self, model: Model, run: Trajectory, span: float = 10.0) -> Any:
+        """Outputs of this model under the hand of a run, with sliders of lambda and mu of each layer, for a notebook.
+
+        Args:
+            model: scene of the model, with the materials of the run; the sliders begin at them.
+            run: a full run.
+            span: largest ratio of a slider's value and its first one, above 1 [1].
+
+        Returns:
+            ``ipywidgets.VBox``: the sliders and the figure.
+
+        Raises SoftgraspError: ipywidgets is not installed, or see :func:`softgrasp.reduction.reduce.replay`.
+        """
+        return drawn("explorer", self, model, run, span)
+
     def to_pymor(self) -> Any:
         """The model as ``pymor.models.iosys.LTIModel``, affine in ``mu``, ``lambda`` [Pa], ``beta`` [s] of each layer.
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import html
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,11 @@ import scipy.linalg
 
 from softgrasp.fem import Array, Model, OutputColumn, PictureMesh, ReducedSystem, SoftgraspError, Trajectory
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
+from softgrasp.fem.labelled import package
 from softgrasp.lqr import LoopMargins, LoopTrajectory
-from softgrasp.reduction import ReducedModel, ReducedTrajectory
+from softgrasp.reduction import ReducedModel, ReducedTrajectory, online
 from softgrasp.reduction.reduce import errors, replay
+from softgrasp.reduction.replay import full_run, replay_inputs
 from softgrasp.study.control.plots import bode
 from softgrasp.study.pictures import MOST_FRAMES, histories, move_bytes
 from softgrasp.study.pictures.style import CYCLE, FULL, WIDTH, length_unit, log_axis, paper_style
@@ -103,6 +105,32 @@ def model_errors(rom: ReducedModel, model: Model, run: Trajectory) -> Any:
         top.set_title(f"{rom.name}: error of the deformation {100 * error:.2g} %")
         top.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return _free(figure)
+
+
+def explorer(rom: ReducedModel, model: Model, run: Trajectory, span: float) -> Any:
+    """Sliders of lambda and mu of each layer above the outputs of a reduced model. Not collective: one rank."""
+    if not 1 < span < np.inf:
+        raise SoftgraspError(f"span = {span:g} must be a ratio above 1, such as 10")
+    widgets, full, own = package("ipywidgets"), full_run(model, run), model.system.materials
+    sliders = {}
+    for i, (blocks, material) in enumerate(zip(model.system.layers, own, strict=True)):
+        for key, name in (("lam", "lambda"), ("mu", "mu")):
+            if (value := getattr(material, key)) > 0 and not material.part:
+                low, high = np.log10([value / span, value * span])
+                label = f"{name} [Pa]" if len(own) == 1 else f"{blocks.name} {name} [Pa]"
+                sliders[f"{key} {i}"] = widgets.FloatLogSlider(value, min=low, max=high, description=label)
+
+    def show(**values: float) -> None:
+        from IPython.display import display  # a notebook has it
+
+        materials = tuple(
+            replace(m, **{key: values.get(f"{key} {i}", getattr(m, key)) for key in ("lam", "mu")})
+            for i, m in enumerate(own)
+        )
+        step, drive = replay_inputs(rom, rom.at(materials), full)
+        display(reduced(online.run(step, **drive)))
+
+    return widgets.VBox([*sliders.values(), widgets.interactive_output(show, sliders)])
 
 
 def _written(file: str | Path, content: bytes) -> Path:

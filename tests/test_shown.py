@@ -132,6 +132,26 @@ def test_figures_show_what_the_objects_hold(objects: dict[str, Any], tmp_path: P
     assert html.unescape(view._repr_html_().split('srcdoc="')[1].split('">')[0]) == view.html
 
 
+def test_sliders_show_the_reduced_model_at_their_material(
+    objects: dict[str, Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("ipywidgets")
+    shown: list[Any] = []
+    monkeypatch.setattr("softgrasp.study.notebook.reduced", shown.append)
+    rom, model, run = (objects[key] for key in ("rom", "model", "run"))
+    lam, mu, _ = rom.explore(model, run).children
+    assert (lam.description, mu.description) == ("lambda [Pa]", "mu [Pa]")
+    mu.value = 2 * mu.value
+    other = model.with_materials(mu=mu.value)
+    for answer, at in zip(shown, (model, other), strict=True):
+        expected = sg.replay(rom, at, run).outputs
+        np.testing.assert_allclose(answer.outputs, expected, rtol=0, atol=1e-9)  # of 5 m, rounding of K(mu)
+    assert np.abs(shown[1].outputs - shown[0].outputs).max() > 0.01  # a stiffer body lags less
+    with pytest.raises(SoftgraspError, match=r"span = 1 must be a ratio above 1"):
+        rom.explore(model, run, span=1)
+    capsys.readouterr()  # what a display without a notebook prints
+
+
 def test_a_sweep_from_python_is_the_runs_one_by_one() -> None:
     values = {"tissue.material.mu": [20.0, 500.0], "tissue.cells": [[4, 8]]}
     table = sg.sweep("paper_forward", values)
