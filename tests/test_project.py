@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 import softgrasp
+from tools.draw_badges import FOLDER, badge, facts
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("fem", "reduction", "lqr", "study")
@@ -238,6 +239,13 @@ def test_what_is_cited_is_the_version_of_the_code() -> None:
     assert f"version {version}" in readme
     assert f"version = {{{version}}}" in readme
     assert re.search(r"^## \[(\d.*?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[1] == version
+
+
+@pytest.mark.serial
+def test_badges_say_what_the_project_states() -> None:
+    for name, value in facts().items():
+        assert (FOLDER / f"{name}.svg").read_text() == badge(name, value), "run python -m tools.draw_badges"
+        assert f"![{name}](docs/badges/{name}.svg)" in (ROOT / "README.md").read_text()
 
 
 @pytest.fixture(scope="module")
