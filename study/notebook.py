@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import html
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -120,9 +121,9 @@ def explorer(rom: ReducedModel, model: Model, run: Trajectory, span: float) -> A
                 label = f"{name} [Pa]" if len(own) == 1 else f"{blocks.name} {name} [Pa]"
                 sliders[f"{key} {i}"] = widgets.FloatLogSlider(value, min=low, max=high, description=label)
 
-    def show(**values: float) -> None:
-        from IPython.display import display  # a notebook has it
+    display: Any = import_module("IPython.display").display  # a notebook has it, ipywidgets need it
 
+    def show(**values: float) -> None:
         materials = tuple(
             replace(m, **{key: values.get(f"{key} {i}", getattr(m, key)) for key in ("lam", "mu")})
             for i, m in enumerate(own)

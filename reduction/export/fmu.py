@@ -10,6 +10,7 @@ import subprocess
 import tempfile
 import xml.etree.ElementTree as ET
 import zipfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -112,7 +113,8 @@ def write_archive(path: Path, texts: dict[str, str], face: Face, sources: tuple[
     except OSError as error:
         raise ResourceError(f"{path} cannot be written ({error.strerror or error}); name another file") from error
     finally:
-        fresh.unlink(missing_ok=True)
+        with suppress(OSError):  # its folder may be none
+            fresh.unlink()
     return path
 
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import h5py
 import meshio
 import numpy as np
 import pytest
@@ -17,15 +20,23 @@ from mpi4py import MPI
 import softgrasp as sg
 from softgrasp.fem.checksums import read_arrays, read_manifest
 from softgrasp.fem.errors import Interrupted, SoftgraspError
+from softgrasp.fem.fields import vtu
+from softgrasp.fem.frame import balance
 from softgrasp.fem.mesh.cells import check_straight
+from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.mesh.tissue_mesh import structured_mesh
+from softgrasp.fem.model import contact
 from softgrasp.fem.obstacles import small
 from softgrasp.fem.obstacles.coulomb import Coulomb
 from softgrasp.fem.reduced import ReducedSystem
+from softgrasp.fem.run import checkpoint, snapshots
 from softgrasp.fem.run.contact import rest
+from softgrasp.fem.run.contact.finite import FiniteContactMidpoint
+from softgrasp.fem.run.frame.midpoint import LinearTurningStep
 from softgrasp.fem.run.simulate import RunOptions
 from softgrasp.fem.scene.text import BYTES
-from softgrasp.fem.solve import modes
+from softgrasp.fem.solve import modes, solvers
+from tests.test_failed_solves import Failing, broken
 
 pytestmark = pytest.mark.serial
 Act = Callable[[Path, pytest.MonkeyPatch], Any]
@@ -82,6 +93,12 @@ def pipe(path: Path) -> Path:
 
 def text(path: Path, content: str) -> Path:
     path.write_text(content)
+    return path
+
+
+def long(path: Path) -> Path:
+    with path.open("wb") as file:
+        file.truncate(BYTES + 1)
     return path
 
 
@@ -156,6 +173,98 @@ def at_rest(system: ReducedSystem) -> Act:
     return lambda *_: system.rest_at(np.zeros(1))
 
 
+def other_file(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        del file["Z"]
+        file["Z"] = np.zeros((1, 1))
+
+
+def unsealed(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        Z = file["Z"][()]
+        del file["Z"]
+        file["Z"] = Z
+
+
+def no_space(*_: Any) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def full_disk(module: Any, name: str, *keys: str, **how: Any) -> Act:
+    """A run where this step of writing finds the disk full."""
+
+    def act(folder: Path, patch: pytest.MonkeyPatch) -> None:
+        patch.setattr(module, name, no_space)
+        sg.simulate(model(STEPS, *keys), RunOptions(folder, **how))
+
+    return act
+
+
+def in_the_way(name: str) -> Act:
+    """A run that finds a folder in the place of its file."""
+
+    def act(folder: Path, _: Any) -> None:
+        (folder / name).mkdir()
+        sg.simulate(model(STEPS, "output.snapshots='hdf5'"), RunOptions(folder))
+
+    return act
+
+
+def hinged(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    """Two squares that meet in a node, where no loose part may be."""
+    patch.setattr(contact, "MOST_LOOSE", 0)
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [2, 1, 0], [2, 2, 0]], dtype=float)
+    triangles = np.array([[0, 1, 3], [0, 3, 2], [3, 4, 5]])
+    meshio.write(folder / "a.vtu", meshio.Mesh(points, [("triangle", triangles)]))
+    meshed(folder / "a.vtu", "contact.sides=['bottom']", "contact.box=false")
+
+
+def no_passes(_: Path, patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(small, "PASSES", 0)
+    problem = small.DependentProblem("NumPy")
+    problem.restart(np.eye(1), np.array([0]))
+    problem.solve(1, np.eye(1), -np.ones(1), 1e-9)
+
+
+def lacking(name: str, call: Callable[[], Any]) -> Act:
+    """A call where an optional package is not installed."""
+
+    def act(_: Path, patch: pytest.MonkeyPatch) -> None:
+        patch.setitem(sys.modules, name, None)
+        call()
+
+    return act
+
+
+def pressed(**parts: Any) -> Act:
+    """A step with contact at finite strain, in this state."""
+    law = SimpleNamespace(law=SimpleNamespace(name="stvk"))
+    step: Any = SimpleNamespace(free_load=0.0, w_array=0.0, body=law, **parts)
+    return lambda *_: FiniteContactMidpoint.press(step, np.zeros(1), np.zeros(1), False)
+
+
+def no_root(_: Path, patch: pytest.MonkeyPatch) -> None:
+    """A run in the frame of the hand in which Newton's method does not converge."""
+    patch.setattr(LinearTurningStep, "_find", lambda *_: SimpleNamespace(iterations=-1, norm=1.0))
+    sg.simulate(model("effects.finite_strain=false", name="turn_over"))
+
+
+def wrong_solve(_: Path, patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(solvers.TissueSolver, "residual", lambda *_: 1.0)
+    patch.setattr(solvers, "DIRECT_ERROR", -1.0)
+    sg.simulate(model(STEPS))
+
+
+def hand_does_not_settle(_: Path, patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(balance, "MOST", 0)
+    sg.simulate(model(name="turn_over"), force=lambda *_: np.zeros(3))
+
+
+def hash_of_a_folder(folder: Path, _: Any) -> None:
+    keys = ["motion.profile='csv'", "motion.target=false", f"motion.csv='{folder}'"]
+    scene_hash(sg.load_scene("paper_forward", keys))
+
+
 E = np.eye(2)
 PLANT = ReducedSystem(E, -E, np.ones((2, 1)), E, np.zeros(2), np.zeros((1, 2)), np.zeros((1, 2)))
 LAYER = "tissue.layers.a={box=[[0, 0], [1, 1]], material='fat', beta=1.0}"
@@ -204,20 +313,20 @@ SENTENCES: list[tuple[Act, str]] = [
     (streamed(Path.unlink), "snapshots-rank0.h5 cannot be read ("),
     (streamed(lambda path: text(path, "no HDF5")), "snapshots-rank0.h5 cannot be read ("),
     (no_room, "output.snapshots: 5 columns of "),
-    (no_rest, "contact: no equilibrium with the obstacles after 0 rounds; move them, or take time.start = 'rest'"),
+    (no_rest, "contact: no equilibrium with the obstacles after 0 rounds; move them, or set time.start = 'rest'"),
     (run("motion.drive='force'", force=not_finite), "the force on the hand is nan in x in step 1, at t = "),
     (run("tissue.cells=[2, 4]", name="turn_over", force=lambda *_: np.full(3, np.nan)),
      "the force on the hand is nan in step 1; it must be finite"),
     (run("effects.finite_strain={law='stvk'}", "motion.duration=1e-3", "time.end=2e-3", STEPS),
-     "finite strain (stvk): "),
+     ", where the law describes no solid; use effects.finite_strain.law = 'neo-hooke', a gentler motion or a stiffer "),
     (scene("control.R=[[1.0, 2.0], [2.0, 1.0]]", name="paper_lqr"), "control.R has the eigenvalue -1; all must be > 0"),
     (scene("control.R=0.0", name="paper_lqr"), "control.R is 0.0; it must be > 0"),
     (scene(LAYER), "tissue.layers.a.beta needs effects.damping; give it or drop beta"),
     (moved_by("0,0,0\n0.1,0,0\n"), "m.csv covers 0 to 0.1 s, the run needs 0 to "),
-    (moved_by("0,0,0\n0.1,nan,0\n"), "holds nan as column 2, at t = 0.1 s, in data row 2; give finite numbers"),
+    (moved_by("0,0,0\n0.1,nan,0\n"), "has nan as column 2, at t = 0.1 s, in data row 2; give finite numbers"),
     (run("motion.profile='csv'", "motion.target=false", "motion.csv='nowhere.csv'"),
      "nowhere.csv cannot be read (No such file or directory); name an existing CSV file"),
-    (lambda folder, _: sg.load_scene(text(folder / "a.toml", " " * (BYTES + 1))),
+    (lambda folder, _: sg.load_scene(long(folder / "a.toml")),
      "the scene file is larger than 64 MiB; give a text file"),
     (scene("tissue.material={young=1.0, rho=1.0}"),
      "tissue.material.poisson is missing; young and poisson go together"),
@@ -230,12 +339,41 @@ SENTENCES: list[tuple[Act, str]] = [
     (scene("tissue.layers.a={tag=2, material='fat'}"), "layers.a.tag needs tissue.mesh; on a structured box give box"),
     (scene("obstacle=[{kind='polygon', name='a', points=[[0, 0, 0], [1, 1], [1, 0]]}]", name="push_disc"),
      "points[0] has 3 entries; it must have 2"),
+    (lambda folder, _: vtu.Collection.read(text(folder / "a.pvd", "x")), "it is not whole"),
+    (lambda folder, _: vtu.check_file(text(folder / "a", "xy"), "2:0"), "it is not what was written"),
+    (hand_does_not_settle,
+     "the hand's velocity in a step does not converge, where it turns by 0 rad; use more time.steps"),
+    (hash_of_a_folder, "cannot be read (Is a directory)"),
+    (hinged, "1 parts of a.vtu have no contact facet and hang on the rest by single nodes or edges: join the cells "),
+    (no_passes, "contact: 0 passes leave the forces of 1 points open; lower obstacle.parts"),
+    (lacking("pymor.models.iosys", lambda: model().to_pymor()),
+     "pyMOR is not installed; `pip install pymor` brings it"),
+    (lacking("control", PLANT.to_control), "python-control is not installed; `pip install control` brings it"),
+    (pressed(jump=1), "contact at finite strain cannot act in a step that is divided into substeps; raise time.steps"),
+    (pressed(jump=None, _find=lambda _: SimpleNamespace(iterations=-1)),
+     "contact at finite strain (stvk): the step does not converge under the forces of the obstacles; raise "),
+    (no_root, "the step does not converge, with |R| at "),
+    (in_the_way("snapshots-rank0.h5"), "; choose another --out"),
+    (in_the_way("snapshots.h5"), "; remove it or free the disk"),
+    (streamed(other_file), "snapshots-rank0.h5 has (1, 1) numbers, this run needs (5, "),
+    (streamed(unsealed), "snapshots-rank0.h5 is damaged (its numbers have no checksums); run again without --resume"),
+    (full_disk(snapshots, "reserve_room", "output.snapshots='hdf5'"),
+     "snapshots-rank0.h5 cannot be written ([Errno 28]"),
+    (full_disk(checkpoint, "write_manifest", until=2),
+     "checkpoint.json cannot be written ([Errno 28] No space left on "),
+    (lambda *_: modes._solve(Failing(solve=broken), model().system, 2, [], []),  # type: ignore[arg-type]
+     "modes: the iteration with the 22 x 22 stiffness failed (error code 76); check material, mesh and contact zone"),
+    (wrong_solve, "the matrix is singular, indefinite or badly scaled: check material, mesh and contact zone"),
+    (lambda *_: solvers._factor(Failing(setUp=broken), Failing(getSize=lambda: (4, 4)), "cholesky"),  # type: ignore[arg-type]
+     "cholesky: the factorisation of the tissue matrix (n_e = 4) failed (PETSc error 76); check material and mesh"),
+    (run("effects.finite_strain={law='stvk'}", "effects.gravity=[0.0, -1e5]", "time.start='equilibrium'", STEPS),
+     "finite strain (stvk): no equilibrium beyond "),
     (bad_mode, "modes: mode 1 has the relative residual "),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("act", "sentence"), SENTENCES, ids=[sentence[:40] for _, sentence in SENTENCES])
 def test_sentence_names_what_is_wrong(act: Act, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(SoftgraspError, match=re.escape(sentence)) as caught:
+    with pytest.raises((SoftgraspError, ValueError), match=re.escape(sentence)) as caught:
         act(tmp_path, monkeypatch)
     assert "\n" not in str(caught.value).strip()

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,17 @@ import pytest
 import softgrasp as sg
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.lqr.dense import modal
+from softgrasp.lqr.dense.paper import paper_form
 from softgrasp.lqr.design.scene import weight
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.loop.filter import Filter
 from softgrasp.lqr.lowrank import newton, radi
 from softgrasp.lqr.lowrank.shifted import make_shifted
+from softgrasp.lqr.observer.sensors import Noise, make_sensors
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import check_weights
 from softgrasp.lqr.reduced.bases import make_family
+from softgrasp.lqr.reduced.retune import Retuner
 
 pytestmark = pytest.mark.serial
 Act = Callable[[Path, pytest.MonkeyPatch], Any]
@@ -69,6 +73,25 @@ def one_newton_step(*_: Any) -> None:
     newton.NewtonADI(max_iterations=1, modes=0).solve(problem())
 
 
+def unsettled(_: Path, patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(ImplicitInput, "max_iterations", 0)
+    ImplicitInput(E / 2, np.ones(2)).solve(np.full(2, 9.0))
+
+
+def no_space(*_: Any) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def full_disk(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(newton, "write_manifest", no_space)
+    newton.NewtonADI(checkpoint=folder, checkpoint_every=1).solve(problem())
+
+
+def other_density(*_: Any) -> None:
+    old: Any = SimpleNamespace(reference=[SimpleNamespace(dense=1.0, rho=1.0)])
+    Retuner.at(old, (SimpleNamespace(dense=2.0, rho=2.0),))  # type: ignore[arg-type]
+
+
 E = np.eye(2)
 SENTENCES: list[tuple[Act, str]] = [
     (lambda *_: check_weights(np.eye(3), E, 2, 2), "Q has the shape (3, 3); it must be (2, 2), one row per output"),
@@ -100,12 +123,19 @@ SENTENCES: list[tuple[Act, str]] = [
      "motion.target is [0.0, 0.0], where the hand starts; give another place to go"),
     (lambda *_: sg.solve(problem("control.Q=0.0"), "radi"),
      "the outputs weighted with Q are all zero; give an output and a Q that is not zero"),
+    (unsettled, "the saturated inputs did not settle in 0 rounds; use a smaller time step"),
+    (full_disk, "newton.json cannot be written ([Errno 28] No space left on device); free the disk"),
+    (other_density, "rho = 2 differs from 1; re-tuning covers lambda, mu and beta"),
+    (lambda *_: paper_form(problem("effects.reaction=true")),
+     "the paper's matrices are those of one-way coupling, on one "),
+    (lambda *_: make_sensors(problem(), [[9.0, 9.0]], Noise(1e-3)),
+     "markers[0] = [9.0, 9.0] lies outside the body; move"),
     (no_steps, "steps = 0 must be at least 1"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("act", "sentence"), SENTENCES, ids=[sentence[:40] for _, sentence in SENTENCES])
 def test_sentence_names_what_is_wrong(act: Act, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(SoftgraspError, match=re.escape(sentence)) as caught:
+    with pytest.raises((SoftgraspError, ValueError), match=re.escape(sentence)) as caught:
         act(tmp_path, monkeypatch)
     assert "\n" not in str(caught.value).strip()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,16 @@ from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.bases.pod import cholesky_of
 from softgrasp.reduction.bases.truncation import Truncation
+from softgrasp.reduction.bridges.mujoco import MujocoTissue, mujoco_body
 from softgrasp.reduction.certified.trainer import Trainer
+from softgrasp.reduction.export.c import write_files
+from softgrasp.reduction.export.fmu import write_fmu
+from softgrasp.reduction.identify.data import Measurements
+from softgrasp.reduction.identify.near import _write_table, experiment
 from softgrasp.reduction.identify.posterior import check_posterior
 from softgrasp.reduction.identify.unknowns import parse_unknowns
 from softgrasp.reduction.online import prepared
+from softgrasp.reduction.online import run as run_online
 from softgrasp.reduction.strain.nnls import nnls
 
 pytestmark = pytest.mark.serial
@@ -48,11 +55,32 @@ def rom() -> Any:
     return made()[2]
 
 
-def own() -> sg.Model:
+@cache
+def growing() -> tuple[sg.Model, Trajectory, Any]:
+    """The same with a basis that makes an unstable model."""
+    full = model("time.steps=40")
+    run = sg.simulate(full)
+    return full, run, sg.reduce(full, run, "global_pod", 10)
+
+
+@cache
+def turning() -> Any:
+    """A model in the frame of the hand, in the plane."""
+    keys = ["tissue.cells=[2, 4]", "time.steps=30", "output.snapshots='memory'", "effects.finite_strain=false"]
+    full = sg.build("turn_over", keys)
+    return sg.reduce(full, sg.simulate(full), N=14)
+
+
+def own(*keys: str) -> sg.Model:
     def W(F: Any, p: Any) -> Any:
         return p.a * (ufl.tr(F.T * F) - 2 - 2 * ufl.ln(ufl.det(F)) + (ufl.det(F) - 1) ** 2)
 
-    return model("tissue.parameters={a=1.0}", energy=W)
+    return model("tissue.parameters={a=1.0}", *keys, energy=W)
+
+
+def two_motions(folder: Path, _: Any) -> None:
+    data = Measurements("a.csv", np.zeros(1), np.zeros((1, 2)), (np.zeros(2), np.zeros((2, 2))))
+    experiment(model("motion.drive='force'", "effects.reaction=true"), data, folder / "a")
 
 
 def damaged(folder: Path, _: Any) -> Any:
@@ -90,13 +118,35 @@ SENTENCES: list[tuple[Act, str]] = [
     (lambda *_: sg.suggest_markers(own(), "mu", 1e-3, 1),
      "markers are chosen for lambda, mu, rho and beta; leave out "),
     (lambda *_: sg.suggest_markers(model("effects.finite_strain={law='neo-hooke'}"), "mu", 1e-3, 1),
-     "markers are chosen by linear elasticity, and effects.finite_strain is on; take "),
+     "markers are chosen by linear elasticity, and effects.finite_strain is on; use "),
     (lambda *_: parse_unknowns(["beta"], model("effects.damping=false")), "--fit beta: beta needs effects.damping; "),
     (lambda *_: parse_unknowns(["lambda"], model("tissue.material={lambda=0.0, mu=1.0, rho=1.0}")),
      "--fit lambda: the scene's value is 0; the fit starts there and needs one > 0"),
     (lambda *_: rom().at(()), "0 materials are given; the model has 1 layers"),
     (lambda *_: prepared(rom().at(), None, True), "give the time step dt [s]"),
     (lambda *_: sg.gradient(rom(), lambda y: 0.0), "the gradient of a reduced model needs the step dt [s]"),
+    (lambda *_: Trainer(own("reduction.layers='apart'")),
+     "reduction.layers = 'apart' cannot go with parameters of an own"),
+    (lambda *_: MujocoTissue(turning(), None), "the model is plane; MuJoCo needs one of three dimensions"),
+    (lambda *_: mujoco_body(turning()), "the model is plane; MuJoCo needs one of three dimensions"),
+    (lambda *_: turning().at(0.01).run(force=lambda *_: np.zeros(3), steps=0),
+     "steps = 0: a run under a force has at "),
+    (lambda *_: turning().at(0.01).run(force=lambda *_: np.full(3, np.nan), steps=1),
+     "the force on the hand in step 1 is "),
+    (lambda folder, _: write_fmu(growing()[2], folder / "a.fmu"), "; export another N or a structure-preserving basis"),
+    (lambda *_: sg.replay(growing()[2], *growing()[:2]),
+     "; choose another N or a structure-preserving basis, or run with "),
+    (lambda folder, _: write_files(below_a_file(folder), {"a.c": ""}),
+     "cannot be written (Not a directory); name another fo"),
+    (lambda folder, _: write_fmu(rom(), below_a_file(folder)),
+     "cannot be written (Not a directory); name another file"),
+    (lambda folder, _: _write_table(below_a_file(folder), np.eye(2)),
+     ": the measured motion cannot be written there (Not a "),
+    (two_motions, "a.csv: the scene gives the force on the hand, so its motion q_* cannot be given too"),
+    (lambda *_: run_online(rom().at(), hand=(np.zeros((3, 1)), np.zeros((3, 2))), dt=0.1),
+     "the hand's tables have the shapes (3, 1) and (3, 2); both must be (steps + 1, 2)"),
+    (lambda *_: replace(rom().at(), E=np.full_like(rom().at().E, np.nan)).check_independent(),
+     "the reduced matrices are not finite; check basis and materials"),
     (lambda *_: sg.reduce(model(), sg.simulate(model("output.snapshots='none'")), "global_pod"),
      "output.snapshots must be 'memory' for a reduction; bases are built from the states in memory"),
 ]  # fmt: skip
