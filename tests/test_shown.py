@@ -196,7 +196,7 @@ def test_young_and_poisson_are_lambda_and_mu(objects: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("call", [sg.simulate, sg.problem, sg.design])
 def test_a_name_where_a_model_is_needed_says_what_to_write(call: Any) -> None:
-    with pytest.raises(SceneError, match=r'write softgrasp\.build\("paper_forward"\)'):
+    with pytest.raises(SceneError, match=r'give softgrasp\.build\("paper_forward"\)'):
         call("paper_forward")
 
 
