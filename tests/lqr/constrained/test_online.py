@@ -230,7 +230,7 @@ def test_file_holds_the_plan(tmp_path: Path) -> None:
         assert np.array_equal(own.step(q, v), again.step(q, v))
     with pytest.raises(ControlError, match="this controller follows a plan to its own target"):
         again.towards(np.zeros(2))
-    with pytest.raises(ControlError, match="the plan takes 5 states"):
+    with pytest.raises(ControlError, match="the plan has 5 states"):
         replace(own, planner=replace(own.planner, T=own.planner.T[:, :5]) if own.planner else None)
 
 

@@ -283,7 +283,7 @@ def test_files_that_make_no_sense(file: Path, tmp_path: Path) -> None:
 
 def test_a_step_that_no_memory_holds_is_refused(tmp_path: Path) -> None:
     for dt in (1e-300, 1e-9):
-        with pytest.raises(SceneError, match=r"--dt .*: a run of 3 s .* GiB is free; take .* steps or fewer"):
+        with pytest.raises(SceneError, match=r"--dt .*: a run of 3 s .* GiB is free; use .* steps or fewer"):
             drive_of(made()[1], dt=dt)
     long = tmp_path / "long.csv"
     long.write_text("0,0,0\n1e8,1,1\n")
