@@ -202,6 +202,10 @@ def test_a_name_where_a_model_is_needed_says_what_to_write(call: Any) -> None:
 
 def test_the_names_of_the_package_are_the_public_ones() -> None:
     assert set(dir(sg)) == {*sg.__all__, "__version__"}
+    with pytest.raises(AttributeError, match=r"module 'softgrasp' has no attribute 'build_model'; it has ClosedLoop, "):
+        sg.build_model  # type: ignore[attr-defined]  # noqa: B018
+    with pytest.raises(AttributeError, match=r"module 'softgrasp\.fem' has no attribute 'build_model'"):
+        sg.fem.build_model  # noqa: B018
 
 
 def test_a_missing_package_is_named(objects: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:

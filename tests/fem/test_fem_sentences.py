@@ -173,6 +173,12 @@ def at_rest(system: ReducedSystem) -> Act:
     return lambda *_: system.rest_at(np.zeros(1))
 
 
+def changed_list(folder: Path, _: Any) -> None:
+    vtu.Collection(folder / "a.pvd", "a run").add(0.5, folder / "a.vtu", "1:2")
+    content = (folder / "a.pvd").read_text()
+    vtu.Collection.read(text(folder / "a.pvd", content.replace("0.5", "0.7")))
+
+
 def other_file(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         del file["Z"]

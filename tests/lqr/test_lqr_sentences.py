@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from petsc4py import PETSc
 
 import softgrasp as sg
 from softgrasp.fem.errors import SoftgraspError
@@ -25,6 +26,7 @@ from softgrasp.lqr.lowrank.shifted import make_shifted
 from softgrasp.lqr.observer.sensors import Noise, make_sensors
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import check_weights
+from softgrasp.lqr.plant.second_order import second_order
 from softgrasp.lqr.reduced.bases import make_family
 from softgrasp.lqr.reduced.retune import Retuner
 
@@ -92,6 +94,11 @@ def other_density(*_: Any) -> None:
     Retuner.at(old, (SimpleNamespace(dense=2.0, rho=2.0),))  # type: ignore[arg-type]
 
 
+def gyroscopic(*_: Any) -> None:
+    M, D = (PETSc.Mat().createDense((2, 2), array=A, comm=PETSc.COMM_SELF) for A in (E, np.array([[0, 1.0], [-1, 0]])))
+    second_order((M, D, M), E, E)
+
+
 E = np.eye(2)
 SENTENCES: list[tuple[Act, str]] = [
     (lambda *_: check_weights(np.eye(3), E, 2, 2), "Q has the shape (3, 3); it must be (2, 2), one row per output"),
@@ -123,6 +130,7 @@ SENTENCES: list[tuple[Act, str]] = [
      "motion.target is [0.0, 0.0], where the hand starts; give another place to go"),
     (lambda *_: sg.solve(problem("control.Q=0.0"), "radi"),
      "the outputs weighted with Q are all zero; give an output and a Q that is not zero"),
+    (gyroscopic, "D is not symmetric; gyroscopic and circulatory terms are not covered"),
     (unsettled, "the saturated inputs did not settle in 0 rounds; use a smaller time step"),
     (full_disk, "newton.json cannot be written ([Errno 28] No space left on device); free the disk"),
     (other_density, "rho = 2 differs from 1; re-tuning covers lambda, mu and beta"),

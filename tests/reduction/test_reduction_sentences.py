@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -22,7 +23,9 @@ from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.bases.pod import cholesky_of
 from softgrasp.reduction.bases.truncation import Truncation
 from softgrasp.reduction.bridges.mujoco import MujocoTissue, mujoco_body
+from softgrasp.reduction.certified.oscillators import SecondOrder
 from softgrasp.reduction.certified.trainer import Trainer
+from softgrasp.reduction.contact.replay import errors_contact
 from softgrasp.reduction.export.c import write_files
 from softgrasp.reduction.export.fmu import write_fmu
 from softgrasp.reduction.identify.data import Measurements
@@ -76,6 +79,17 @@ def own(*keys: str) -> sg.Model:
         return p.a * (ufl.tr(F.T * F) - 2 - 2 * ufl.ln(ufl.det(F)) + (ufl.det(F) - 1) ** 2)
 
     return model("tissue.parameters={a=1.0}", *keys, energy=W)
+
+
+def other_steps(*_: Any) -> None:
+    model: Any = SimpleNamespace(V=np.eye(1), layout=0)
+    full: Any = SimpleNamespace(trajectory=SimpleNamespace(contact=None))
+    errors_contact(model, full, full)
+
+
+def dependent(*_: Any) -> None:
+    one: Any = SimpleNamespace(stiffness=lambda *_: np.eye(2), density=lambda _: np.zeros((2, 2)))
+    SecondOrder(*np.zeros((4, 2, 2))).modes(one)
 
 
 def two_motions(folder: Path, _: Any) -> None:
@@ -142,6 +156,8 @@ SENTENCES: list[tuple[Act, str]] = [
      "cannot be written (Not a directory); name another file"),
     (lambda folder, _: _write_table(below_a_file(folder), np.eye(2)),
      ": the measured motion cannot be written there (Not a "),
+    (other_steps, "the full run has other steps than the reduced one, or no contact"),
+    (dependent, "the reduced mass is singular; its basis vectors are linearly dependent"),
     (two_motions, "a.csv: the scene gives the force on the hand, so its motion q_* cannot be given too"),
     (lambda *_: run_online(rom().at(), hand=(np.zeros((3, 1)), np.zeros((3, 2))), dt=0.1),
      "the hand's tables have the shapes (3, 1) and (3, 2); both must be (steps + 1, 2)"),
