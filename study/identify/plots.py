@@ -82,7 +82,7 @@ def _ellipses(answer: Identified, file: Path) -> tuple[Path, ...]:
     for ax, (i, j) in zip(axes.flat, pairs, strict=False):
         _ellipse(ax, answer, i, j)
     handles, names = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=5)
+    figure.legend(handles, names, loc="outside upper center", ncols=5 if len(handles) < 6 else 3)
     return save(figure, file)
 
 
