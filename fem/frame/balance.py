@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.frame.integrals import Sums, coadjoint
+from softgrasp.fem.frame.integrals import Sums, coadjoint, turned_momentum
 from softgrasp.fem.frame.rotation import cayley, cross_matrix, rotation_matrix, rotation_vector
 from softgrasp.fem.petsc import Array
 
@@ -85,43 +85,43 @@ class HandBalance:
         Raises SolverError: the hand turns too far in a step.
         """
         A, b = self._map(hand, sums, travel)
-        before, m, free, h = sums.momenta(self.M, hand.xi), sums.first + travel.work[:3], self.free, self.dt
-        here = np.ix_(free, free)
-        xi = np.array(guess)
+        before, free, h, inverse = sums.momenta(self.M, hand.xi), self.free, self.dt, np.zeros((6, 6))
+        weight, slope = self._load(hand.Q, sums.first + travel.work[:3], load)
+        right, here, xi = before - b + h * weight, np.ix_(free, free), np.array(guess)
+        sizes, terms = np.abs(A), np.abs(b) + np.abs(before)
         for _ in range(MOST):
-            after, ad = A @ xi + b, h / 2 * coadjoint(xi)
-            force, slope = self._load(hand.Q, xi[3:], m, load)
-            both = h / 2 * (after + before)
-            P, L = cross_matrix(both[:3]), cross_matrix(both[3:])
-            J = A - ad @ A - np.block([[np.zeros((3, 3)), P + h * slope[:3]], [P, L + h * slope[3:]]])
-            R = after - before - ad @ (after + before) - h * force
+            after = A @ xi + b
+            both = h / 2 * turned_momentum(after + before)
+            both[:, 3:] += h * slope
+            J = A - h / 2 * coadjoint(xi) @ A - both
+            R = A @ xi - right - both @ xi  # mu_{n+1} - mu_n - h ad*(xi) (mu_n + mu_{n+1}) / 2 - h F
             if not (np.isfinite(J).all() and np.isfinite(R).all()):
                 break
-            inverse = np.linalg.inv(J[here])
-            change = inverse @ R[free]
-            xi[free] -= change
-            size = np.abs(A) @ np.abs(xi) + np.abs(b) + np.abs(before)  # of what R is a difference of
-            if (np.abs(change) <= ROUNDING * (np.abs(inverse) @ size[free])).all():
+            inverse[here] = np.linalg.inv(J[here])
+            change = inverse @ R
+            xi -= change
+            left = h / 2 * (coadjoint(change) @ (A @ change))  # R is quadratic: what this correction leaves
+            size = sizes @ np.abs(xi) + terms  # of what R is a difference of
+            if (np.abs(inverse @ left) <= ROUNDING * (np.abs(inverse) @ size)).all():
                 return xi
         raise SolverError(
             f"the hand's velocity in a step does not converge, where it turns by {h * np.linalg.norm(xi[3:]):.2g} rad; "
             "use more time.steps"
         )
 
-    def _load(self, Q: Array, spin: Array, m: Array, load: Array) -> tuple[Array, Array]:
-        """Mean load in the hand's axes, Qm^-1 of that in space, with the weight of hand and tissue; its rate by spin.
+    def _load(self, Q: Array, m: Array, load: Array) -> tuple[Array, Array]:
+        """Mean load in the hand's axes, Qm^-1 of that in space, with the weight of hand and tissue: F = a + B Omega.
 
         Shapes are (6,) and (6, 3).
         """
-        force, torque, g = load[:3] @ Q, load[3:] @ Q, self.g @ Q
-        half = self.dt / 2
-        fall, falls = g - half * np.cross(spin, g), half * cross_matrix(g)
-        result = np.concatenate([force - half * np.cross(spin, force), torque - half * np.cross(spin, torque)])
-        slope = half * np.vstack([cross_matrix(force), cross_matrix(torque)]) + self.heavy[:, :3] @ falls
-        result += self.heavy[:, :3] @ fall
-        result[3:] += np.cross(m, fall)
-        slope[3:] += cross_matrix(m) @ falls
-        return result, slope
+        axes = np.stack([load[:3], load[3:], self.g]) @ Q
+        force, torque, g = axes
+        slopes = self.dt / 2 * cross_matrix(axes)  # x - h/2 Omega x x = x + h/2 x x Omega
+        lever, heavy = cross_matrix(m), self.heavy[:, :3]
+        value, slope = np.concatenate([force, torque]) + heavy @ g, slopes[:2].reshape(6, 3) + heavy @ slopes[2]
+        value[3:] += lever @ g
+        slope[3:] += lever @ slopes[2]
+        return value, slope
 
     def _map(self, hand: HandPlace, sums: Sums, travel: Travel) -> tuple[Array, Array]:
         """A and b with mu_{n+1} = A xi + b for a known travel of the tissue."""
@@ -134,7 +134,7 @@ class HandBalance:
         A[3:, :3] += 2 * cross_matrix(first)
         A[3:, 3:] += 2 * (lever + np.trace(between) * eye - between + np.trace(travel.C) * eye - travel.C.T)
         b = 2 * s * travel.work - sums.drift - self.M @ hand.xi
-        b[3:] += travel.turning - np.cross(first, hand.xi[:3]) - lever @ hand.xi[3:]
+        b[3:] += travel.turning - cross_matrix(first) @ hand.xi[:3] - lever @ hand.xi[3:]
         return A, b
 
 

@@ -74,7 +74,7 @@ class Sums:
         """[P; L] (6,) [kg m/s, kg m2/s] for M = M_hand + M_rigid in space, (6, 6), and xi = [V; Omega] (6,)."""
         V, spin = xi[:3], xi[3:]
         result = M @ xi + self.drift
-        result[3:] += np.cross(self.first, V) + np.trace(self.B) * spin - self.B.T @ spin + self.turning
+        result[3:] += cross_matrix(self.first) @ V + np.trace(self.B) * spin - self.B.T @ spin + self.turning
         return np.asarray(result)
 
 
@@ -95,5 +95,17 @@ def in_space(M: Array) -> Array:
 
 def coadjoint(xi: Array) -> Array:
     """The matrix of ad* with P' = P x Omega, L' = L x Omega + P x V for [P; L]' = ad* [P; L], (6, 6)."""
-    V, W = cross_matrix(xi[:3]), cross_matrix(xi[3:])
-    return np.block([[-W, np.zeros((3, 3))], [-V, -W]])
+    V, W = cross_matrix(xi.reshape(2, 3))
+    full = np.zeros((6, 6))
+    full[:3, :3] = full[3:, 3:] = -W
+    full[3:, :3] = -V
+    return full
+
+
+def turned_momentum(momenta: Array) -> Array:
+    """The matrix of xi -> ad*(xi) [P; L] for given momenta (6,), (6, 6)."""
+    P, L = cross_matrix(momenta.reshape(2, 3))
+    full = np.zeros((6, 6))
+    full[:3, 3:] = full[3:, :3] = P
+    full[3:, 3:] = L
+    return full

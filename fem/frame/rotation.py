@@ -20,13 +20,13 @@ from softgrasp.fem.petsc import Array
 
 SMALL = 1e-2  # angle below which the series have three terms [rad]: the next is below 1e-14
 ROUND = 2 * np.pi  # a whole turn [rad]
+CROSS = np.zeros((3, 9))  # entries of the matrix of w x by rows, each a multiple of one of w
+CROSS[[0, 1, 2], [7, 2, 3]], CROSS[[0, 1, 2], [5, 6, 1]] = 1.0, -1.0
 
 
 def cross_matrix(w: Array) -> Array:
     """The matrix of w x, (..., 3, 3), for w (..., 3)."""
-    H = np.zeros((*w.shape, 3))
-    H[..., 2, 1], H[..., 0, 2], H[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
-    return H - np.swapaxes(H, -1, -2)
+    return np.asarray((w @ CROSS).reshape(*w.shape, 3))
 
 
 def _coefficients(theta: Array) -> tuple[Array, Array, Array]:

@@ -47,7 +47,8 @@ class TurningMatrices:
 
     def turned(self, H: Array) -> Array:
         """E(H), the mass with all nodes of its second factor turned by H (d, d), (k, k)."""
-        return np.asarray(np.tensordot(H, self.E, 2))
+        k = len(self.M)
+        return np.asarray((H.ravel() @ self.E.reshape(-1, k * k)).reshape(k, k))
 
     def spun(self, spin: Array) -> Array:
         """K + E((Omega x)^2): the stiffness that is left in a steady spin, (k, k)."""
@@ -65,7 +66,7 @@ class TurningSteps:
 
     Attributes:
         a: coordinates reached, (k,).
-        Y: integrals int rho phi_i,k y_l, (k, d, d).
+        Y: integrals int rho phi_i,k y_l, (d, d, k).
         drift: G'y, (n_s,).
         kinetic: int rho |y|^2 / 2 [J].
     """
@@ -84,10 +85,8 @@ class TurningSteps:
         return cross_matrix(spin)[: self.d, : self.d]
 
     def _pairs(self, w: Array, H: Array, z: Array) -> Array:
-        """Integrals int rho phi_i,k (w + H z)_l, (k, d, d)."""
-        E = self.small.E
-        each, turned = E @ w, E @ z  # (d, d, k)
-        return np.moveaxis(each + np.einsum("lm,kmi->kli", H, turned), 2, 0)
+        """Integrals int rho phi_i,k (w + H z)_l, (d, d, k)."""
+        return np.asarray(self.small.E @ w + H @ (self.small.E @ z))
 
     def _turned_drift(self, H: Array, z: Array) -> Array:
         """G' of H z, (n_s,): int rho H z and int rho r x H z."""
@@ -99,20 +98,20 @@ class TurningSteps:
     @staticmethod
     def _product(w: Array, H: Array, z: Array, Y: Array) -> float:
         """Integral int rho (w + H z) . y from the integrals of y."""
-        return float(w @ np.trace(Y, axis1=1, axis2=2) + np.sum(H * np.tensordot(z, Y, 1).T))
+        return float(w @ np.trace(Y) + np.sum(H * (Y @ z).T))
 
     # ---- what is known of a state
 
     def row(self) -> Array:
         """Numbers of :class:`softgrasp.fem.frame.integrals.Sums`."""
-        d, X = self.d, np.tensordot(self.a, self.Y, 1)  # int rho z_k y_l
+        d, X = self.d, self.Y @ self.a  # int rho z_k y_l
         turn = [X[0, 1] - X[1, 0]] if d == 2 else [X[1, 2] - X[2, 1], X[2, 0] - X[0, 2], X[0, 1] - X[1, 0]]
         return np.concatenate([self.drift, self.small.G[:, :d].T @ self.a, self.small.S.T @ self.a, turn])
 
     def rate(self, spin: Array) -> Array:
         """Rates a' of the coordinates in the frame that turns with ``spin``, (k,)."""
         turned = self.small.turned(self._matrix(spin)) @ self.a
-        return np.asarray(np.linalg.solve(self.small.M, np.trace(self.Y, axis1=1, axis2=2) - turned))
+        return np.asarray(np.linalg.solve(self.small.M, np.trace(self.Y) - turned))
 
     def energy(self) -> float:
         """A'K a / 2 + int rho |y|^2 / 2 [J]."""
@@ -146,9 +145,9 @@ class TurningSteps:
             self.inverse = np.linalg.inv(self.still - s * s * small.G @ np.linalg.solve(inertia, small.G.T))
         sums, xi = Sums.of(self.row(), small.G.shape[1]), np.array(guess)
         w = 2 * self.past[0] - self.past[1]
-        fallen = hand.Q.T @ balance.g
+        fallen, held = hand.Q.T @ balance.g, small.E @ self.a
         for count in range(MOST):
-            xi = balance.velocity(hand, sums, self._travel(w), force, xi)
+            xi = balance.velocity(hand, sums, self._travel(w, held), force, xi)
             spin, rate = cross_matrix(xi[3:]), s * (xi - hand.xi)
             rate[:3] += spin @ xi[:3] - fallen + self.dt / 2 * spin @ fallen
             load = -(small.G @ rate[balance.free]) - small.S @ (spin @ spin)[:d, :d].ravel()
@@ -167,14 +166,15 @@ class TurningSteps:
             f"{self.dt * float(np.linalg.norm(xi[3:])):.2g} rad in it; use a shorter step"
         )
 
-    def _travel(self, w: Array) -> Travel:
-        """What the tissue does in a step of w."""
+    def _travel(self, w: Array, held: Array) -> Travel:
+        """What the tissue does in a step of w; ``held`` is E a."""
         small, d, end = self.small, self.d, self.a + 2 * w
-        X = np.tensordot(end, 2 * self.s * np.moveaxis(small.E @ w, 2, 0) - self.Y, 1)
+        moved = small.E @ w
+        X = (2 * self.s * moved - self.Y) @ end
         turning = np.array([0.0, 0.0, X[0, 1] - X[1, 0]])
         if d == 3:
             turning[:2] = X[1, 2] - X[2, 1], X[2, 0] - X[0, 2]
-        C = np.einsum("i,klij,j->kl", end, small.E, self.a + w, optimize=True)
+        C = (held + moved) @ end  # int rho z_1 (z + w)'
         return Travel(spatial(small.G.T @ w), square(small.S.T @ w, d), turning, square(C.ravel(), d))
 
     def _system(self, spin: Array, load: Array) -> tuple[Array, Array]:
@@ -184,7 +184,7 @@ class TurningSteps:
         once, twice = small.turned(H), small.turned(H @ H)
         left = self.still + s * s * (2 * once + twice)
         held = small.K @ self.a + s * s * ((once + twice) @ self.a)
-        return left, s * np.trace(self.Y, axis1=1, axis2=2) + load - held
+        return left, s * np.trace(self.Y) + load - held
 
     def _advance(self, w: Array, spin: Array) -> None:
         """Carry on by w."""
