@@ -12,12 +12,14 @@ from mpi4py import MPI
 
 import softgrasp as sg
 from softgrasp.fem.errors import ResourceError
+from softgrasp.fem.frame.integrals import Sums
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction import online
 from softgrasp.reduction.bridges import MujocoTissue, mujoco_body, write_mujoco
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.system import ModelError
 from softgrasp.reduction.turning.model import TurningModel
+from softgrasp.reduction.turning.stepper import TurningSteps
 
 mujoco: Any = pytest.importorskip("mujoco", reason="MuJoCo is no dependency: pip install 'softgrasp[mujoco]'")
 pytestmark = pytest.mark.serial
@@ -79,34 +81,39 @@ def test_of_second_order_beside_the_own_two_way_model(rom: TurningModel) -> None
 
 
 def test_a_free_body_with_tissue_keeps_what_a_rigid_one_keeps() -> None:
-    """MuJoCo's explicit gyroscopic forces are of first order; tissue adds nothing of that size."""
-    rom, h, drift = reduced({"damping": False}, 24), 1e-3, []
+    """MuJoCo's explicit gyroscopic forces are of first order; over several starts tissue hardly adds to them."""
+    rom, h, rng, drifts = reduced({"damping": False}, 24), 1e-3, np.random.default_rng(0), []
     small = rom.at(h)
-    for rigid in (True, False):
-        model = world(mujoco_body(rom), h)
-        data, at = mujoco.MjData(model), mujoco.MjData(model)
-        tissue = MujocoTissue(rom, model, dt=h)
-        data.qvel[:] = [0.3, 0.1, 0.0, 2.0, 1.0, 1.2]
-        kept = []
-        for n in range(1500):
-            data.qfrc_applied[:] = [0.5, -0.3, 0.2, 0.01, 0.02, 0.0] if n < 50 else 0.0
-            if rigid:
-                mujoco.mj_step(model, data)
-            else:
-                tissue.step(data)
-            if n >= 50 and n % 25 == 0:
-                at.qpos[:], at.qvel[:] = data.qpos, data.qvel
-                mujoco.mj_forward(model, at)
-                J, Q = np.zeros((6, 6)), at.xmat[tissue.body].reshape(3, 3)
-                mujoco.mj_jacBody(model, at, J[:3], J[3:], tissue.body)
-                V, spin = Q.T @ J[:3] @ data.qvel, Q.T @ J[3:] @ data.qvel
-                P = (rom.M_hand + small.rigid)[:3] @ np.concatenate([V, spin])
-                P = P + small.small.G[:, :3].T @ tissue.e + np.cross(spin, small.small.G[:, :3].T @ tissue.a)
-                kept.append(Q @ P)
-        drift.append(np.ptp(kept, axis=0).max() / np.linalg.norm(kept[0]))
-        assert rigid or np.abs(tissue.a).max() > 0
-    assert drift[1] < 1.02 * drift[0]  # the paths differ a little; measured 0.999
-    assert drift[1] < 5e-4
+    M = rom.M_hand + small.rigid
+    model = world(mujoco_body(rom), h)
+    for _ in range(6):
+        spin, drift = rng.normal(size=3), []
+        start = np.concatenate([0.3 * rng.normal(size=3), 2.5 * spin / np.linalg.norm(spin)])
+        for alone in (True, False):
+            data, at, tissue, kept = mujoco.MjData(model), mujoco.MjData(model), MujocoTissue(rom, model, dt=h), []
+            data.qvel[:] = start
+            for n in range(750):
+                data.qfrc_applied[:] = [0.5, -0.3, 0.2, 0.01, 0.02, 0.0] if n < 50 else 0.0
+                if alone:
+                    mujoco.mj_step(model, data)
+                else:
+                    tissue.step(data)
+                if n >= 50 and n % 25 == 0:
+                    at.qpos[:], at.qvel[:] = data.qpos, data.qvel
+                    mujoco.mj_forward(model, at)
+                    J, Q = np.zeros((6, 6)), at.xmat[tissue.body].reshape(3, 3)
+                    mujoco.mj_jacBody(model, at, J[:3], J[3:], tissue.body)
+                    xi = np.concatenate([Q.T @ J[:3] @ data.qvel, Q.T @ J[3:] @ data.qvel])
+                    row = TurningSteps(small.small, h, tissue.a, tissue.e, xi[3:]).row()
+                    P, L = Sums.of(row, 6).momenta(M, xi).reshape(2, 3) @ Q.T
+                    kept.append([P, L + np.cross(at.xpos[tissue.body], P)])
+            drift.append(np.ptp(kept, axis=0).max(axis=1) / np.linalg.norm(kept[0], axis=1))
+            assert alone or np.abs(tissue.a).max() > 0
+        assert drift[1][0] < 5e-4
+        drifts.append(drift)
+    rigid, soft = np.sum(drifts, axis=0)  # changes of the linear and of the angular momentum
+    # swinging tissue adds 4e-7 of the momentum, which does not grow in time: 0.8 and 0.6 % of a flight of 0.75 s
+    assert soft / rigid == pytest.approx([1.0, 1.0], abs=0.015)
 
 
 def test_the_compiled_step_is_that_in_numpy(rom: TurningModel) -> None:
