@@ -30,6 +30,7 @@ ORDER = (
     "certified",
     "control",
     "effects",
+    "turn",
     "arm",
     "ranks",
 )  # of the gallery
