@@ -23,6 +23,7 @@ from softgrasp.fem.frame.balance import HandBalance, HandPlace, Travel
 from softgrasp.fem.frame.integrals import Sums, square
 from softgrasp.fem.frame.rotation import cross_matrix, spatial
 from softgrasp.fem.petsc import Array
+from softgrasp.reduction.turning.compiled import FreeStep
 
 MOST = 100  # largest number of iterations of a step with a free hand [1]
 TOL = 1e-13  # of such a step, over the largest load
@@ -80,6 +81,7 @@ class TurningSteps:
         self.drift = small.G.T @ rate + self._turned_drift(W, self.a)
         self.kinetic = float(self._product(rate, W, self.a, self.Y)) / 2
         self.scale, self.inverse, self.iterations = 0.0, np.zeros((0, 0)), 0
+        self.code: FreeStep | None = None
 
     def _matrix(self, spin: Array) -> Array:
         return cross_matrix(spin)[: self.d, : self.d]
@@ -143,8 +145,19 @@ class TurningSteps:
         if not self.inverse.size:
             inertia = balance.M[np.ix_(balance.free, balance.free)]
             self.inverse = np.linalg.inv(self.still - s * s * small.G @ np.linalg.solve(inertia, small.G.T))
+            self.code = FreeStep.of(self, balance, MOST, TOL)
         sums, xi = Sums.of(self.row(), small.G.shape[1]), np.array(guess)
         w = 2 * self.past[0] - self.past[1]
+        if self.code is not None:
+            count = self.code.solve(
+                w, xi, a=self.a, Y=self.Y, Q=hand.Q, start=hand.xi, before=sums.momenta(balance.M, hand.xi),
+                drift=sums.drift, first=sums.first, B=sums.B, force=force,
+            )  # fmt: skip
+            if count >= 0:
+                self._advance(w, xi[3:])
+                self.iterations += count
+                return xi
+            w, xi = 2 * self.past[0] - self.past[1], np.array(guess)  # NumPy states the reason
         fallen, held = hand.Q.T @ balance.g, small.E @ self.a
         for count in range(MOST):
             xi = balance.velocity(hand, sums, self._travel(w, held), force, xi)
