@@ -79,7 +79,7 @@ pictures: demo ## make the README's pictures again
 docs: $(STAMP) ## build the documentation into out/site, with all links checked
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-docs-serve: docs ## the same on http://localhost:8000, where the search works
+docs-serve: docs ## the same on http://localhost:8000
 	$(BIN)/python -m http.server --bind 127.0.0.1 --directory out/site 8000
 
 clean: ## remove .venv, out and caches

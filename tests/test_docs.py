@@ -9,6 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -323,6 +324,7 @@ def test_a_tutorial_shows_what_its_cells_print_draw_and_return(monkeypatch: pyte
     assert page.images["book/1.png"] != page.images["book/0.png"]
     assert "<strong>Trajectory of the full model</strong><table>" in page.text
     assert page.thumbnail is not None
+    assert replace(page, images=dict([*page.images.items()][:1])).thumbnail == page.thumbnail  # of the first figure
     wrong = gallery.jupytext.reads("# %%\nassert 1 == 2", fmt="py:percent")
     with pytest.raises(RuntimeError, match=r"wrong\.py: [\s\S]*assert 1 == 2"):
         gallery.execute(wrong, "wrong.py")
@@ -358,6 +360,9 @@ def test_pages_build_strictly(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
     page = (tmp_path / "site" / "index.html").read_text()
     assert re.findall(r'<(?:script|link)[^>]+(?:src|href)="https?://', page) == []
+    worker = page.index('<script src="iframe-worker.js">')  # pages opened from the disk have their search by it
+    assert worker < page.index('<script src="assets/javascripts/bundle')
+    assert (tmp_path / "site" / "search" / "search_index.js").read_text().startswith("var __index")
     assert "<code>tissue.refine</code>" in (tmp_path / "site" / "scene.html").read_text()
     api = (tmp_path / "site" / "api.html").read_text()
     assert (tmp_path / "site" / "tutorials" / "forward.ipynb").stat().st_size > 1000

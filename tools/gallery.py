@@ -42,10 +42,10 @@ class Tutorial:
 
     @property
     def thumbnail(self) -> bytes | None:
-        """A small picture of the last figure; None without figures."""
+        """A small picture of the first figure; None without figures."""
         if not self.images:
             return None
-        with Image.open(io.BytesIO(list(self.images.values())[-1])) as picture:
+        with Image.open(io.BytesIO(next(iter(self.images.values())))) as picture:
             picture.seek(2 * getattr(picture, "n_frames", 1) // 3)  # of a film: on the way
             small = picture.convert("RGB")
         small.thumbnail(THUMBNAIL)

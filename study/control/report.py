@@ -27,6 +27,10 @@ from softgrasp.study.report import Columns, Page, Section, Share, Table, caption
 from softgrasp.study.report.equation import control_equation
 
 Row = tuple[Any, ...]
+HOW = (
+    "Each equation is projected on N basis vectors and solved. The bases of the paper need P first, the a-priori modes "
+    "do not."
+)
 LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal")
 CAPTIONS = {
     "move.png": "The move to the target at some instants, full plant under the optimal gain.",
@@ -164,18 +168,34 @@ def _settled_gain(solution: RiccatiSolution) -> list[tuple[str, str]]:
     return [("last change of the gain", text)] if text else []
 
 
-def summary(study: GainStudy) -> list[str]:
-    """What came out, in three sentences."""
-    design, optimal = study.design, study.design.gain_check.optimal
-    first, solved = f"The Riccati equation is solved to the relative residual {design.solution.residual:.1e}.", ""
-    change = gain_change(design.solution)
+def accuracy(study: GainStudy) -> list[str]:
+    """How far equation and small gain are from exact, in a sentence each."""
+    residual, change = study.design.solution.residual, gain_change(study.design.solution)
+    solved = f"The Riccati equation is solved to the relative residual {residual:.1e}."
     if change is not None:
-        first = solved = (
-            f"The Riccati equation is solved by a Galerkin method: its true relative residual is "
-            f"{design.solution.residual:.1e}; between the last two spaces the gain changed by "
-            f"{percent(change['hand'])} in the rows of the hand and by {percent(change['tissue'])} in those of the "
-            "tissue."
+        solved = (
+            f"The Riccati equation is solved by a Galerkin method: its true relative residual is {residual:.1e}; "
+            f"between the last two spaces the gain changed by {percent(change['hand'])} in the rows of the hand and by "
+            f"{percent(change['tissue'])} in those of the tissue."
         )
+    bound = small_excess(study)
+    small = f"The gain of the small controller costs at most {percent(bound)} more than the optimal one."
+    return [solved, *([small] if np.isfinite(bound) else [])]
+
+
+def small_excess(study: GainStudy) -> float:
+    """Bound on the excess cost of the small controller's gain, as ``reduced.csv`` has it; nan where there is none."""
+    if (small := study.controller) is None:
+        return float("nan")
+    N = small.controller.plant.N
+    found = (r for b in study.bases if b.name == small.method for r in b.reports if r.N == N)
+    return next((r.cost_excess_at_most for r in found), float("nan"))
+
+
+def summary(study: GainStudy) -> list[str]:
+    """What came out, in two or three sentences."""
+    design, optimal = study.design, study.design.gain_check.optimal
+    outcome: list[str] = []
     cost = f"The move costs {optimal:.4g} at least; the abscissa of its loop is {design.quality.abscissa:.3g} 1/s."
     if isinstance(study, ControlStudy):
         full = study.loops.full
@@ -185,16 +205,16 @@ def summary(study: GainStudy) -> list[str]:
         )  # fmt: skip
         free = "" if study.planned is None else " without obstacles and limits"
         free = free if study.loops.touching is None else " without obstacles"
-        first = f"The optimal gain{free} {reaches}. {solved}".rstrip()
+        outcome = [f"The optimal gain{free} {reaches}."]
         cost = f"The move{free} costs {paid:.4g}; the Riccati equation predicts {optimal:.4g}."
         if full.saturated:
             excess = (paid + study.loops.to_come) / optimal - 1
             cost = f"With the limits of the loads the move costs {percent(excess)} more than without them."
     if study.controller is None:
-        return [first, cost, "No small controller is certified, see the notes."]
+        return [*outcome, cost, "No small controller is certified, see the notes."]
     c = study.controller.controller
     return [
-        first,
+        *outcome,
         cost,
         f"The small controller has N = {c.plant.N} columns and takes {1e6 * study.tick:.2g} us of each tick of "
         f"{1e3 * c.period:g} ms.",
@@ -233,9 +253,7 @@ def _fast(r: Retuned) -> str:
 
 def reduced_table(bases: Sequence[BasisGains]) -> Table:
     """One row a gain; errors of an unusable gain are shown, its cost is not."""
-    reports = [(b, r) for b in bases for r in b.reports]
-    best = [i for i, (b, r) in enumerate(reports) if r is b.best()]
-    return replace(table_of([r for _, r in reports], REDUCED, "Reduced Riccati equations"), best=best)
+    return table_of([r for b in bases for r in b.reports], REDUCED, "Reduced Riccati equations")
 
 
 def margin_section(margins: LoopMargins, figures: Sequence[tuple[Path, str]]) -> Section:
@@ -287,8 +305,9 @@ def compose(study: GainStudy, seconds: Mapping[str, float], pictures: Sequence[P
     result = Section("Result", rows=result_rows(study, seconds), terminal=True)
     if not isinstance(study, ControlStudy):
         return Page(
-            f"{name}: optimal gain", summary(study), [*noted, *_observed(study), result], {}, files, " --gain-only"
-        )
+            f"{name}: optimal gain", summary(study), [*noted, *_observed(study), result], {}, files, " --gain-only",
+            errors=accuracy(study),
+        )  # fmt: skip
     parts, outcome = sections(study, noted, result, pictures), summary(study)
     if study.loops.touching is not None:
         outcome = [touching_sentence(study, study.loops.touching), *outcome]
@@ -296,7 +315,8 @@ def compose(study: GainStudy, seconds: Mapping[str, float], pictures: Sequence[P
         from softgrasp.study.control.obstacle.report import sentence
 
         outcome = [sentence(study.planned), *outcome]
-    return Page(f"{name}: optimal feedback", outcome, parts, csv_tables(study), [*pictures, *files])
+    tables = csv_tables(study)
+    return Page(f"{name}: optimal feedback", outcome, parts, tables, [*pictures, *files], errors=accuracy(study))
 
 
 def sections(study: ControlStudy, notes: Sequence[Section], result: Section, drawn: Sequence[Path]) -> list[Section]:
@@ -347,8 +367,7 @@ def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Secti
     plan = study.loops.plan
     end = max((r.bounded_to for b in study.bases for r in b.reports if r.stable), default=plan.dt * plan.steps)
     text = (
-        "Each equation is projected on N basis vectors and solved. The bases of the paper need P first, the a-priori "
-        "modes do not. The gain of least cost of each basis is tested on the full plant, and the next best where that "
+        "The gain of least cost of each basis is tested on the full plant, and the next best where that "
         "is not stable; the poles of the others are those of the modes kept. Only stable gains are offered. "
         f"Excess cost and its bounds are those of the loop as it runs: {running_words(study.design)}. The excess cost "
         "is J/J* - 1 over the least cost J* of all inputs, which need not be held, wait or keep a limit. The first "
@@ -360,7 +379,7 @@ def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Secti
     best = [{"basis": b, "best": b.best()} for b in study.bases]
     parts = [
         table_of(best, BEST, "Best stable gain of each basis").section(terminal=True),
-        reduced_table(study.bases).section(text, figures=figures),
+        reduced_table(study.bases).section(HOW, details=text, figures=figures, best=None),
     ]
     refused = [(TITLES[b.name], b.refused) for b in study.bases if b.refused]
     parts += [Section("Refused", header=("basis", "reason"), rows=refused)] if refused else []

@@ -32,7 +32,7 @@ from softgrasp.study.forward.accuracy import accuracy_report, check_estimated, e
 from softgrasp.study.forward.cautions import looked_at, run_warnings, small_obstacles
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures import Frames, speed_up
-from softgrasp.study.report import Page, Section, captioned, of_scene
+from softgrasp.study.report import Page, Section, captioned, in_words, of_scene
 from softgrasp.study.shell import Flags, Session, folder_lock, list_files
 
 SLOW_START = 5.0  # time of the equilibrium from which it is announced [s]
@@ -177,13 +177,11 @@ def _sections(result: Simulation, drawn: list[Path]) -> list[Section]:
     scene = result.scene
     faster = speed_up(np.array([0.0, scene.time_end]))
     move = "The move in real time." if faster == 1 else f"The move at {faster:g} times its speed."
-    effects = [
-        (name, effect.active(scene), *((effect.term, effect.cost) if effect.active(scene) else ("", "")))
-        for name, effect in EFFECTS.items()
-    ]
+    effects = [(name, effect.term, effect.cost) for name, effect in EFFECTS.items() if effect.active(scene)]
+    off = [name for name, effect in EFFECTS.items() if not effect.active(scene)]
     return [
         Section("", figures=captioned(drawn, CAPTIONS | {"move.gif": move})),
         Section("Result", rows=result.rows(), terminal=True),
         of_scene(scene),
-        Section("Effects", header=("effect", "on", "adds", "cost"), rows=effects),
+        Section("Effects", f"Off: {in_words(off)}.", header=("effect", "adds", "cost"), rows=effects),
     ]

@@ -93,14 +93,14 @@ class Turns:
         return all(x.high <= STEADY * x.low for x in (self.again, self.new))
 
     def sentence(self, own: float, others: str) -> str:
-        """The headline: speed and error in one sentence, or that there is none. ``others``: error at new materials."""
-        error = f"error {percent(own)} at the scene's parameter, {others}"
+        """The headline: error and speed in one sentence, or that there is none. ``others``: error at new materials."""
+        error = f"Its error of the deformation is {percent(own)} at the scene's parameter, {others}"
         how = f"quartiles of {self.rounds} rounds, processor time of both in turn"
         if self.steady:
             again = f"{self.again} times as fast as the full model, {self.new} at a new parameter"
-            return f"It runs {again} (median and {how}); {error}."
+            return f"{error}; it runs {again} (median and {how})."
         again, new = (f"{x.low:.3g} to {x.high:.3g} times as fast" for x in (self.again, self.new))
-        return f"The times scatter too much to name a speed-up ({again}, at a new parameter {new}: {how}); {error}."
+        return f"{error}; the times scatter too much to name a speed-up ({again}, at a new parameter {new}: {how})."
 
 
 def in_turn(model: Model, again: Callable[[], object], new: Callable[[], object]) -> Turns:

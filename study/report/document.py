@@ -40,12 +40,15 @@ class Section:
     rows: Sequence[Sequence[Any]] = ()  # a table; every row as long as the header. Numbers are shown with four digits.
     figures: Sequence[tuple[Path, str]] = ()  # (picture file, caption); the files are embedded
     terminal: bool = False  # a terminal shows texts and table too
-    best: Sequence[int] = ()  # rows of a long table that stand unfolded; the first ones if there are none
+    # rows of a long table that stand unfolded; the first ones if there are none, and no row of any table for None
+    best: Sequence[int] | None = ()
     details: str = ""  # further paragraphs, folded on the page
 
     @property
     def unfolded(self) -> Sequence[Sequence[Any]]:
         """Rows that stand unfolded on the page, and alone in a terminal."""
+        if self.best is None:
+            return ()
         if not self.header or len(self.rows) <= MOST_ROWS:
             return self.rows
         return [self.rows[i] for i in self.best or range(SHOWN)]
@@ -80,7 +83,7 @@ class Table:
     def section(self, text: str = "", title: str | None = None, **more: Any) -> Section:
         """The table as a part of a page; ``more`` of its attributes."""
         title = self.title if title is None else title
-        return Section(title, text, header=self.header, rows=self.rows, best=self.best, **more)
+        return Section(title, text, header=self.header, rows=self.rows, **{"best": self.best, **more})
 
     def markdown(self) -> str:
         """The table as a README shows it."""

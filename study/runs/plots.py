@@ -10,7 +10,7 @@ import numpy as np
 
 from softgrasp.study.pictures import BLUE, COLUMN, CYCLE, OUTLINE, colour_map, few_ticks, paper_style, save
 from softgrasp.study.report import Table
-from softgrasp.study.runs.sweep import SweepAxis, SweepPoint, axis_label
+from softgrasp.study.runs.sweep import DECADE, SweepAxis, SweepPoint, axis_label
 
 BARS = 16  # numbers that a picture of two runs shows: the largest changes
 PANELS = 4  # outputs of a picture
@@ -35,6 +35,10 @@ def figure_sweep(axes: Sequence[SweepAxis], points: Sequence[SweepPoint], file: 
                 label = None if second is None else f"{axis_label(second.key)} = {value:.4g}"
                 axis.plot([p.values[first.key] for p in shown], y, ".-", color=colour, label=label)
             axis.set_ylabel(name.replace(" lag ", ", largest lag\nbehind the rigid motion "))
+            lags = [p.lags()[name] for p in points if not p.reason]
+            if min(lags) > 0 and max(lags) >= DECADE * min(lags):
+                axis.set_yscale("log")
+                few_ticks(axis.yaxis)
         panels[-1, 0].set_xlabel(f"{first.key.rpartition('.')[0]}.{axis_label(first.key)}".lstrip("."))
         if first.log:
             panels[-1, 0].set_xscale("log")

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem import SceneError
+from softgrasp.fem.scene.file import unit_of
 from softgrasp.study.report import SHOWN, Page, Section, Table, percent
 from softgrasp.study.report.origin import origin
 from softgrasp.study.runs.sweep import METHOD, Sweep, SweepPoint, axis_label, parse_axes, run_sweep_points
@@ -18,6 +19,10 @@ from softgrasp.study.shell import Session, folder_lock
 
 UNITS = {"energy_drift": "energy drift", "seconds": "time [s]"}
 COARSE = 0.1  # error of the deformation above which a reduced sweep is warned of
+UNTESTED = (
+    "A sweep estimates neither the error of mesh and time step nor that of linear elasticity: `softgrasp simulate` "
+    "states them, one point at a time."
+)
 LAG = "lag: largest distance of an output from where it would be if the tissue moved rigidly with the hand."
 REDUCED = (
     f"The model is reduced ({METHOD}) at the scene's own material; error_deformation: against a full run, "
@@ -50,7 +55,8 @@ def summary(sweep: Sweep, points: Sequence[SweepPoint]) -> list[str]:
         low, high = (pick(good, key=lambda point: point.lags()[name]) for pick in (min, max))
         output, unit = name.rstrip("]").split(" lag [")
         at = [
-            f"{p.lags()[name]:.3g} {unit}, at {', '.join(f'{a.key} = {p.values[a.key]:g}' for a in sweep.axes)}"
+            f"{p.lags()[name]:.3g} {unit}, at "
+            + ", ".join(f"{a.key} = {p.values[a.key]:g} {unit_of(a.key)}".rstrip() for a in sweep.axes)
             for p in (low, high)
         ]
         texts.append(f"The lag of {output} is smallest, {at[0]}, and largest, {at[1]}.")
@@ -86,10 +92,7 @@ def run_sweep(
         raise SceneError(f"no point of the sweep could be run; the first: {failed[0]}")
     notes = [f"{len(failed)} of {len(points)} points failed: {failed[0]}"] if failed else []
     if (worst := max(point.numbers.get("error_deformation") or 0.0 for point in points)) > COARSE:
-        notes.append(
-            f"The reduced model has an error of {percent(worst)} at an end of the sweep; "
-            "use --reduced with more columns."
-        )
+        notes.append(f"The error of the reduced model is above {percent(COARSE)}; use --reduced with more columns.")
     result = {"command": "sweep", **origin(scene, comm.size), "reduced": reduced}
     result |= {"points": [point.row() for point in points], "warnings": notes}
 
@@ -102,9 +105,16 @@ def run_sweep(
             Section("", figures=[(files[0], "Largest lag of every output.")] if files else []),
             short_table(points).section(text, terminal=True),
         ]
+        tested = (
+            f"At the ends of the sweep the reduced model has an error of the deformation of {percent(worst)} at most."
+        )
         options = "".join(f" {text}" for text in axes) + (f" --reduced {reduced}" if reduced else "")
         table = {"sweep.csv": sweep_table(points)}
-        return Page(f"{scene.name}: sweep", summary(sweep, points), parts, table, files, options, warnings=notes)
+        return Page(
+            f"{scene.name}: sweep", summary(sweep, points), parts, table, files, options,
+            errors=[] if reduced is None else [tested],
+            warnings=[*notes, UNTESTED],
+        )  # fmt: skip
 
     session.write(scene, result, page)
     return result

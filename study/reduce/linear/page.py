@@ -207,7 +207,8 @@ def box_sections(box: DomainTests) -> list[Section]:
              *(percent(p.errors[i]) for i, _ in shown))
             for p in box.points
         ]  # fmt: skip
-        parts.append(Table(("lambda [Pa]", "mu [Pa]", "", *names), rows).section(f"All parameters, N = {N}."))
+        table = Table(("lambda [Pa]", "mu [Pa]", "", *names), rows)
+        parts.append(table.section(f"All parameters, N = {N}.", best=None))
     return parts
 
 

@@ -495,8 +495,8 @@ def test_default_box_follows_the_material() -> None:
 def test_a_headline_needs_quartiles_that_agree_and_names_the_error_at_new_materials() -> None:
     close, apart = Spread(24.0, 25.0, 26.0), Spread(20.0, 40.0, 60.0)
     said = Turns(close, close, 9).sentence(7e-3, "33.00% in the median and 84.00% at most at new materials")
-    assert said.startswith("It runs 25 (24 to 26) times as fast")
-    assert "error 0.7 % at the scene's parameter" in said
+    assert said.startswith("Its error of the deformation is 0.7 % at the scene's parameter")
+    assert "; it runs 25 (24 to 26) times as fast" in said
     assert "84.00% at most at new materials" in said
     for turns in (Turns(apart, close, 9), Turns(close, apart, 9)):
         assert "too much to name a speed-up" in turns.sentence(7e-3, "")
