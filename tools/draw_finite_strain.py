@@ -53,7 +53,7 @@ def main(out: Path) -> None:
     times, steps = runs[None].times, len(runs[None].times) - 1
     instants = [round(steps * share) for share in SHARES]
     with paper_style():
-        figure = plt.figure(figsize=(7.2, 6.2))
+        figure = plt.figure(figsize=(7.2, 5.3), layout="constrained")
         grid = figure.add_gridspec(3, SHOWN + 1, height_ratios=(1.25, 1.25, 0.8), width_ratios=(*[1] * SHOWN, 0.06))
         for row, (law, model) in enumerate(models.items()):
             picture = gather_picture(model)
@@ -79,7 +79,6 @@ def main(out: Path) -> None:
         axes.set_xlabel("time [s]")
         axes.set_ylabel("tip against the hand, x [m]")
         axes.legend(loc="lower right")
-        figure.subplots_adjust(left=0.09, right=0.93, top=0.95, bottom=0.09, hspace=0.08, wspace=0.05)
         figure.savefig(out, dpi=200)
     gap = np.linalg.norm(tips[None] - tips["neo-hooke"], axis=1).max() / np.linalg.norm(tips["neo-hooke"], axis=1).max()
     sys.stdout.write(f"largest error of the tip {100 * gap:.0f} %\n")

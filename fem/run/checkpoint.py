@@ -128,7 +128,7 @@ def read_checkpoint(scene: Scene, layout: BlockLayout, directory: Path) -> Resta
         if not np.array_equal(arrays.pop("numbering"), _numbering(layout)):
             raise CheckpointError(
                 f"{directory / name} was written with other nodes on rank {layout.comm.rank}, as another version of "
-                f"DOLFINx deals them out; {AGAIN}"
+                f"DOLFINx distributes them; {AGAIN}"
             )
         arrays["residual_first"] = float(arrays["residual_first"])
         return RestartState(entry["run"], entry["step"], entry["legs"], entry["beside"], **arrays)

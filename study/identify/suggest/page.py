@@ -98,7 +98,7 @@ def summary(answer: SuggestedMarkers) -> list[str]:
     best, own = answer.motions[0], answer.motions[0].own
     if best.hidden:
         return [
-            f"Under no motion do these markers see {in_words(best.hidden)}: fit fewer parameters, or move otherwise."
+            f"No motion lets these markers determine {in_words(best.hidden)}: fit fewer parameters, or move otherwise."
         ]
     ratio = float(np.exp(np.log(own / best.deviations[-1]).mean())) if np.isfinite(own).all() else np.inf
     moved = f" under the motion {motion_words(best)}" if len(answer.motions) > 1 else ""
