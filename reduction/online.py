@@ -39,7 +39,7 @@ class ReducedTrajectory(Shown, Labelled):
     output_names: tuple[str, ...]
     """Name of every output, (p,)."""
     system: EnergySystem | Callable[[], EnergySystem] | None = field(default=None, repr=False, kw_only=True)
-    """System of the run, or what makes it: it knows the energy; None where the run's own class does."""
+    """System of the run, or what makes it, for the energy; None where the run's own class has that."""
 
     @cached_property
     def energy(self) -> Array | None:

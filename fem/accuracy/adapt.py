@@ -36,7 +36,7 @@ LINE_TRIES, LINE_STEP = 12, 0.7  # the number of lines grows with a small power 
 
 
 def _with_own(scene: Scene, comm: MPI.Intracomm, mesh: Any, tags: tuple[Any, Any], energy: Any, terms: Any) -> Scene:
-    """The scene with what `build` was given in Python; only those who give it pay for it. Collective."""
+    """The scene with what `build` was given in Python, whose modules are loaded only then. Collective."""
     if mesh is not None and not isinstance(mesh, TissueMesh):
         from softgrasp.fem.mesh.given import with_given_mesh
 

@@ -55,7 +55,7 @@ class Term:
         digest: hash of the form on the mesh of its model, empty before there is one.
 
     Raises:
-        SceneError: in `softgrasp.build`: a name is taken, a value not finite, a form zero, not symmetric or not
+        SceneError: in `softgrasp.build`: a name is used already, a value not finite, a form zero, not symmetric or not
             (bi)linear, stiffness or mass not positive definite with it, or damping that feeds energy.
 
     >>> import softgrasp as sg

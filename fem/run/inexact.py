@@ -41,7 +41,7 @@ class InexactMidpoint(TissueMidpoint):
         self._solve = self._solve_from_guess
 
     def start(self, state: TissueState) -> None:
-        """Set the carried vectors and forget earlier solutions: a run repeats its bits. Collective."""
+        """Set the carried vectors and drop earlier solutions: a run repeats its bits. Collective."""
         super().start(state)
         self.previous.clear()
         self.iterations.clear()

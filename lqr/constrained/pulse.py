@@ -64,7 +64,7 @@ class PulseError:
 
     @cached_property
     def pulses(self) -> int:
-        """Pulses that are summed; raises ControlError when the tissue remembers too many."""
+        """Number of pulses that are summed; raises ControlError when the tissue decays too slowly."""
         decay = -float(self._parts[0].real.max())
         count = np.inf if decay <= 0 else np.ceil(-np.log(FORGOTTEN) / (decay * self.grid))
         if not count <= MOST_PULSES:

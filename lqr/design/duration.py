@@ -45,6 +45,6 @@ def plan(design: Design, own_end: bool) -> LoopPlan:
 
 
 def largest_cost(design: Design, plan: LoopPlan) -> float:
-    """A thousand times what the optimal loop and one that does nothing would pay. Collective."""
+    """A thousand times the cost of the optimal loop and of no motion, summed. Collective."""
     y = outputs(design.problem, design.error)[:, 0]
     return 1e3 * (design.gain_check.optimal + plan.dt * plan.steps * float(y @ design.problem.Q @ y))

@@ -322,7 +322,7 @@ class LoopRun(Stepped):
         if not self.paid <= self.options.most:
             raise SolverError(
                 f"the closed loop diverges: at t = {self.reached * self.dt:.6g} s its cost is {self.paid:.3g}, and no "
-                f"loop that works pays more than {self.options.most:.3g}; raise control.loop.rate or the limit, leave "
+                f"loop that works has more than {self.options.most:.3g}; raise control.loop.rate or the limit, leave "
                 "out the delay, or lower control.Q"
             )
 

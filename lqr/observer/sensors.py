@@ -66,7 +66,7 @@ class Disturbance:
 def make_sensors(problem: RiccatiProblem, markers: list[list[float]], noise: Noise) -> Sensors:
     """Pose, velocity, markers at the free nodes nearest to ``markers`` [m], force. Collective.
 
-    Raises ControlError: a marker lies outside the body, has another number of entries, or two take one node.
+    Raises ControlError: a marker lies outside the body, has another number of entries, or two name one node.
     """
     system, layout = problem.system, problem.layout
     n_s, n, d = layout.n_s, layout.n_local, layout.dimension

@@ -67,7 +67,7 @@ def run_tube(
         every: ticks between two places that are kept.
         seed: of the noise; None: there is none.
         again: whether plans are made again at every interval, else the first one is followed.
-        push: load on the hand that nobody knows of, by the tick [N], (n_s,).
+        push: unknown load on the hand at each tick [N], (n_s,).
     """
     own, generator = deepcopy(controller), np.random.default_rng(seed)
     own.reset()

@@ -108,7 +108,7 @@ def refused(answer: Identified, part: Array, why: str) -> Identified:
 
 
 def chosen(linear: Identified, strained: Identified, part: Array, failed: str = "") -> Identified:
-    """The answer of the law that the data speak for; says which and why. In a tie linear, with both fits' difference.
+    """The answer of the law that fits the data better, with the reason. In a tie linear, with both fits' difference.
 
     S is the sum of squares of a fit, D^2 = |y - y'|^2 / sigma^2 the distance of two fits. If the first law is true,
     S - S' is normal with mean -D^2 and deviation 2 D [C62]; it exceeds c^2 where a standard normal number exceeds

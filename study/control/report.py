@@ -162,7 +162,7 @@ def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[st
 
 
 def _settled_gain(solution: RiccatiSolution) -> list[tuple[str, str]]:
-    """Of a Galerkin gain the changes between the last two spaces: its residual says little of the gain."""
+    """Of a Galerkin gain the changes between the last two spaces: its residual is no measure of the gain."""
     change = gain_change(solution)
     text = change and f"rows of the hand {percent(change['hand'])}, of the tissue {percent(change['tissue'])}"
     return [("last change of the gain", text)] if text else []

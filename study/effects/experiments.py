@@ -140,7 +140,7 @@ class SwitchRuns:
         return None if self.force is None else compare(self.of(a, True), self.of(b, True)).outputs
 
     def alone(self, name: str) -> tuple[Change, float | None]:
-        """Change by one effect switched in the scene; under a force too where the run does not show it. Collective."""
+        """Change by one effect switched in the scene; under a force too where no output changes. Collective."""
         other = self.on ^ {name}
         change = self.change(self.on, other)
         hidden = change.outputs <= self.scene.study.tolerance

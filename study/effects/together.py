@@ -14,7 +14,7 @@ Changes = dict[str, tuple[Change, float | None]]  # of the outputs, and under a 
 
 
 class Rival(NamedTuple):
-    """Which effect is advised in place of one that shows as well."""
+    """Which effect is advised in place of one that changes the outputs as well."""
 
     name: str  # name of the effect
     why: str  # what the scene's validation says of both

@@ -15,7 +15,7 @@ def verdict_of(change: float, controls: bool, costs: bool, tolerance: float) -> 
     """needed, optional or wasted.
 
     Needed: it changes the outputs by more than the tolerance. Optional: it does not, but it is free, or the control
-    problem needs it. Wasted: it costs something and nothing shows it.
+    problem needs it. Wasted: it has a cost and changes no output.
     """
     if change > tolerance:
         return "needed"
@@ -63,7 +63,7 @@ def shows(s: Switch, changes: tuple[Change, float | None], gate: EffectReport, s
 
 
 def needed_for_control(s: Switch, control: float | None, gate: EffectReport, scene: Scene) -> str:
-    """Why the control problem needs an effect that does not show in the run; empty if it does not."""
+    """Why the control problem needs an effect that changes no output of the run; empty if it does not."""
     if control is not None and control > scene.study.tolerance:
         return f"when a force moves the hand, as in the control problem, it changes them by {percent(control)}"
     if s.name == "damping" and scene.control is not None and gate.gate.matters:

@@ -121,7 +121,7 @@ class MeshSummary:
 
 @dataclass(frozen=True)
 class Explanation:
-    """All that explain says."""
+    """All that explain reports."""
 
     name: str  # of the scene
     equation: Equation  # with exactly the terms of this scene
@@ -312,7 +312,7 @@ def on_fewer_cells(scene: Scene, comm: MPI.Intracomm) -> Model | None:
 
 
 def mesh_report(looked: Model, n_e: int, model: Model | None) -> MeshSummary:
-    """Look for singular ends and estimate the error, that of a coarser copy where the mesh takes long. Collective."""
+    """Look for singular ends and estimate the error, that of a coarser copy where the mesh is large. Collective."""
     known = looked if model is None else model
     scene, tissue = known.scene, known.space.mesh
     refine = scene.tissue.refine

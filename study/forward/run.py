@@ -142,7 +142,7 @@ def _equilibrium_bar(bar: Progress) -> Callable[[float], None]:
 
 
 def _announced(model: Model) -> Iterator[str]:
-    """What a run says before it starts. Collective."""
+    """What a run reports before it starts. Collective."""
     modelled = forecasts(model)
     start = _slow_start(modelled, model.system.layout.comm.size)
     yield from filter(None, (told(modelled), start, _few_fields(model), *small_obstacles(model)))

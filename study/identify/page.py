@@ -1,4 +1,4 @@
-"""The page of ``softgrasp identify``: values with their errors, what the data see, and what speaks against them."""
+"""The page of ``softgrasp identify``: values with their errors, what the data determine, and reasons against them."""
 
 from __future__ import annotations
 
@@ -96,12 +96,12 @@ def posterior_sentence(answer: Identified) -> str:
 
 
 def sight_table(answer: Identified) -> Table:
-    """What the data see, the best first."""
+    """What the data determine, the best first."""
     rows = [
         (direction_in_words(answer.unknowns, d, SHOWN_POWER), Share(1 / max(float(s), 1e-12)))
         for s, d in zip(answer.sight, answer.directions, strict=True)
     ]
-    return Table(("the data see", "with a deviation of"), rows, "What the data see")
+    return Table(("the data determine", "with a deviation of"), rows, "What the data determine")
 
 
 def assumed_table(answer: Identified) -> Table:

@@ -1,4 +1,4 @@
-"""The solution that all settings are compared with, and how far it can be trusted itself.
+"""The solution that all settings are compared with, and its own error.
 
     y* = y(m, 4 S) + (y(m, 4 S) - y(m, 2 S)) / 3 + y(M, s) - y(m, s)
 

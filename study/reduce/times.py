@@ -162,4 +162,4 @@ TIMES: Columns = {
     "x new": "up.new .3g",
     "break-even": lambda r: "never" if (runs := r["up"].break_even_runs) is None else str(math.ceil(runs)),
 }
-"""Time of a run, of set-up and run at a new parameter, and offline; speed-ups; runs until offline has paid."""
+"""Time of a run, of set-up and run at a new parameter, and offline; speed-ups; runs until the offline time is saved."""

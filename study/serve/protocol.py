@@ -35,7 +35,7 @@ class RequestError(Exception):
 
 
 def allowed(path: str) -> tuple[str, ...]:
-    """Methods of HTTP that a path takes; all that the server knows where there is no such path."""
+    """Methods of HTTP that a path accepts; all methods of the server where there is no such path."""
     return ("POST",) if path in POSTED else ("GET", "POST")
 
 

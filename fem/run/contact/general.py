@@ -269,7 +269,7 @@ class Contact:
         self.moved = self._take(midpoint.w_array)
 
     def _push_hand(self, n: int, f: Array, drive: Driven) -> None:
-        """Let a two-way hand feel forces f that the step has taken in."""
+        """Apply the reaction of forces f, which the step contains, to a two-way hand."""
         if self.hand is None:
             return
         midpoint = self.midpoint

@@ -17,7 +17,7 @@ ZERO = 1e-12  # of the largest coordinate: rounding of the mesh
 
 @dataclass(frozen=True)
 class PlannedStudy:
-    """A plan, its runs on the full plant, and what it took."""
+    """A plan, its runs on the full plant, and the time of both."""
 
     planned: PlannedControl  # plan and runs
     optimal_cost: float  # least cost J* of all inputs without obstacles and limits

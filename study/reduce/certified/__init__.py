@@ -1,1 +1,1 @@
-"""One reduced model that knows its error."""
+"""One reduced model with a bound or an estimate of its error."""

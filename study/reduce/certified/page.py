@@ -123,5 +123,5 @@ def sentences(certified: CertifiedModel, check: BoxCheck | None, result: dict[st
             f"median, {max(ratios):.3g} times at most."
         )
     if time["query"] > time["full"]:
-        lines.append("A query takes longer than a full run here: the model pays on a finer mesh only.")
+        lines.append("A query takes longer than a full run here: the model is faster on a finer mesh only.")
     return lines

@@ -1,4 +1,4 @@
-"""``softgrasp reduce --tolerance``: one reduced model that knows its error, built by the greedy over a box."""
+"""``softgrasp reduce --tolerance``: one reduced model with a bound of its error, built by the greedy over a box."""
 
 from __future__ import annotations
 

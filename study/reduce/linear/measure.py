@@ -329,7 +329,7 @@ def headline_turns(full: FullRun, sweeps: Sequence[MethodSweep]) -> Turns | None
 
 
 def speed_notes(n_e: int, steps: int, full: FullTimes, sweeps: Sequence[MethodSweep]) -> tuple[str, ...]:
-    """What the speed-up is measured against, the mesh that pays, and the paper's figure beside ours."""
+    """What the speed-up is measured against, the mesh of equal times, and the paper's figure beside ours."""
     against = (
         f"Full model, prefactored: {steps} steps in {1e3 * full.steps:.1f} ms; its factorisation takes "
         f"{1e3 * full.factor:.1f} ms. new: a new parameter, small matrices, test of stability and propagator with the "

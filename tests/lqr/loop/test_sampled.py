@@ -154,7 +154,7 @@ def test_the_simulation_grows_by_the_radius() -> None:
     # after 100 ticks all but the two pairs of the hand are gone
     assert growth(run.inputs[400::4] - target.u) == pytest.approx(found.value, rel=1e-6)
     assert found.value > 1.05
-    with pytest.raises(SolverError, match="no loop that works pays more than 1e"):
+    with pytest.raises(SolverError, match="no loop that works has more than 1e"):
         loop.run(gain, target, 960, law, options=LoopOptions(most=1e6))
     fine = loop.run(gain, target, 960, law, options=LoopOptions(most=2 * run.cost[-1]))
     assert (fine.cost == run.cost).all()

@@ -61,7 +61,12 @@ def test_values_page_and_scene_of_a_fit_that_stands(measured: Path, tmp_path: Pa
     )
     assert result["refused"] == []
     page = (out / "report.html").read_text()
-    for text in ("The data give mu = ", "Values and the parts of their errors", "What the data see", "camera.csv"):
+    for text in (
+        "The data give mu = ",
+        "Values and the parts of their errors",
+        "What the data determine",
+        "camera.csv",
+    ):
         assert text in page
     for name in ("fit.png", "ellipses.png", "history.png", "values.csv", "residuals.csv", "fitted.toml"):
         assert name in result["files"]
