@@ -18,6 +18,7 @@ from softgrasp.fem import (
 from softgrasp.fem.model.scales import SMALL_STRAIN, gradient, magnified, slowest
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.scene.materials import young_poisson
+from softgrasp.fem.scene.obstacles import Obstacle, obstacle_names
 
 STIFF = 0.45  # P1 displacements lock above: the error grows like 1 / (1 - 2 nu) = lambda / mu + 1 [BS92]
 LOCKING = 0.49  # where `effects` measures it
@@ -80,12 +81,30 @@ def small_obstacles(model: Model) -> list[str]:
     parts = edge_parts(entries, layout.order, layout.dimension)
     divided = 1 if parts is None else int(parts(np.array([longest]))[0])
     between, what = longest / max(divided, layout.order), "nodes" if divided == 1 else "points"
-    return [
+    more = "" if any(entry.friction for entry in entries) else ", or more obstacle.parts"
+    return _nodes_alone(entries, layout.order, layout.dimension, longest) + [
         f"Obstacle '{o.name}' is {size:.2g} m {'in radius' if o.kind in ('disc', 'ball') else 'thick'}, less than the "
         f"{between:.2g} m between boundary {what}: only {what} touch, so it can sink in between two; use "
-        + ("smaller cells." if entry.friction else "smaller cells, or more obstacle.parts.")
-        for o, entry in zip(make_obstacles(model.scene, layout.dimension), entries, strict=True)
+        f"smaller cells{more}."
+        for o in make_obstacles(model.scene, layout.dimension)
         if (size := o.shape.size()) < between * (1 - 1e-9)  # edges of equal cells differ by rounding
+    ]
+
+
+def _nodes_alone(entries: list[Obstacle], order: int, d: int, longest: float) -> list[str]:
+    """Points between nodes that would touch, on edges of this length [m], if no obstacle had friction."""
+    from softgrasp.fem.obstacles.spacing import edge_parts
+
+    rough = [name for name, entry in zip(obstacle_names(entries), entries, strict=True) if entry.friction]
+    smooth = [entry.model_copy(update={"friction": 0.0}) for entry in entries]
+    if not rough or (parts := edge_parts(smooth, order, d)) is None:
+        return []
+    if (count := int(parts(np.array([longest]))[0])) == 1:
+        return []
+    other = "smaller cells or tissue.order = 1 or 3" if d == 3 and order == 2 else "smaller cells"
+    return [
+        f"Obstacle '{rough[0]}' has friction, which acts on nodes alone, so only nodes touch, at all obstacles of the "
+        f"scene; without friction points that divide each edge in {count} would touch too. Use {other}."
     ]
 
 

@@ -17,6 +17,7 @@ from rich.console import Console
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.fields.picture import gather_picture
 from softgrasp.fem.model.build import build
+from softgrasp.fem.run.contact.general import contact_surface
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.reduce import reduce
 from softgrasp.study.forward.cautions import small_obstacles
@@ -76,6 +77,22 @@ def test_an_obstacle_that_is_small_against_an_edge_is_warned_of(obstacle: str, o
     assert [text.partition(":")[0] for text in texts] == ([expected] if size else [])
     if "0.24" in size:  # one is enough
         assert texts[0] in explain_model(model).warnings
+
+
+@pytest.mark.parametrize(
+    ("friction", "radius", "parts"),
+    [(0.3, 0.1, 5), (0.3, 0.26, 0), (0.0, 0.1, 0)],  # on edges of 0.25 m: 0.25 / (0.1 / 2) = 5; nodes do; no friction
+)
+def test_friction_of_one_obstacle_that_lets_nodes_alone_touch_is_said(
+    friction: float, radius: float, parts: int
+) -> None:
+    rough = f"{{name='rough', kind='halfspace', normal=[0, 1], offset=-0.5, friction={friction}}}"
+    pin = f"{{name='pin', kind='disc', center=[0.5, -0.6], radius={radius}}}"
+    model = build("paper_forward", [*SCENE[:-1], f"obstacle=[{rough}, {pin}]"])
+    texts = [text for text in explain_model(model).warnings if "nodes alone" in text]
+    assert [f"points that divide each edge in {parts} " in text for text in texts] == [True] * bool(parts)
+    assert all(text.startswith("Obstacle 'rough' has friction") for text in texts)
+    assert (contact_surface(model).B is None) == (friction > 0 or radius > 0.25)  # what the sentence is about
 
 
 @pytest.mark.parametrize("offset", [-5.0, -0.34, -0.25])
