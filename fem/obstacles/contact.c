@@ -244,7 +244,7 @@ int softgrasp_finish(Flat *f, int n, const double *v) {
 void softgrasp_strike(const Flat *f, int n, double *v) {
   const int d = f->d, m = f->n_s, own = f->feels;
   double *impulse = f->impulse + (size_t)n * f->obstacles * d, *force = f->force + (size_t)n * f->obstacles * d;
-  double *kick = f->kick + (size_t)n * m, a[MODES] = {0}, b[MODES] = {0}, wrench[MODES] = {0}, work = 0;
+  double *kick = f->kick + (size_t)n * m, a[MODES] = {0}, b[MODES] = {0}, wrench[MODES] = {0}, work = 0, sum[3] = {0};
   for (int j = 0; j < f->k; j++) {
     if (f->y[j] == 0) continue;
     const int *row = f->row + 4 * j, o = row[0];
@@ -254,6 +254,7 @@ void softgrasp_strike(const Flat *f, int n, double *v) {
       const int u = row[1] * d + c;
       const double y = f->y[j] * e[c];
       impulse[o * d + c] += y;
+      sum[c] += y;
       force[o * d + c] += y / f->dt;
       work += y * f->v[u];
       for (int i = 0; i < m; i++) {
@@ -261,12 +262,15 @@ void softgrasp_strike(const Flat *f, int n, double *v) {
         kick[i] += S[c * m + i] * y;
       }
     }
-    for (int i = 0; i < f->k; i++)
-      if (f->y[i] != 0) work += f->y[j] * f->A[(size_t)j * f->ld + i] * f->y[i] / 2;
+    work += f->y[j] * dot(f->k, f->A + (size_t)j * f->ld, f->y) / 2;
     add_to_r(f, j, f->s * f->y[j]);
+    int next = j + 1; /* rows of a pair share a column of M^-1: one pass over it */
+    while (next < f->k && f->y[next] == 0) next++;
+    if (next < f->k && f->column[next] == f->column[j]) continue;
     const int to = f->ends[f->column[j] + 1];
     for (int k = f->ends[f->column[j]]; k < to; k++)
-      for (int c = 0; c < d; c++) v[(size_t)f->reached_nodes[k] * d + c] += f->shares[k] * f->y[j] * e[c];
+      for (int c = 0; c < d; c++) v[(size_t)f->reached_nodes[k] * d + c] += f->shares[k] * sum[c];
+    memset(sum, 0, sizeof sum);
   }
   for (int i = 0; own && i < m; i++) {
     a[i] = dot(m, f->H + i * m, b);

@@ -39,6 +39,7 @@ SOURCE = Path(__file__).with_name("friction.c")
 DECLARATIONS = """
 void softgrasp_matrix(Rub *f);
 void softgrasp_units(Rub *f);
+void softgrasp_judge(Rub *f);
 int softgrasp_rub(Rub *f, int begin, int rounds);
 void softgrasp_sweep(Rub *f, int sweeps, double still);
 double softgrasp_wrong(Rub *f);
@@ -71,6 +72,7 @@ class Coulomb:
         self.code: Any = None if engine == "NumPy" else friction_library()
         self.tally = np.zeros(3, np.int64)
         self.x, self.kind, self.e = np.zeros((0, 1 + tangents)), np.zeros(0, np.intc), np.zeros((0, 1 + tangents))
+        self.before = np.zeros((0, 1 + tangents))  # forces at which the step before the last ended, if it has
         self.kind0, self.e0, self.other = np.zeros(0, np.intc), np.zeros((0, 1 + tangents)), np.zeros(0, np.intc)
         self.W, self.arrays = np.zeros((0, 0)), dict[str, NDArray[Any]]()
         self.f: Any = None if self.code is None else self.code[0].new("Rub *")
@@ -87,7 +89,7 @@ class Coulomb:
         e[:, 0] = 1.0
         x[:have], e[:have], kind[:have] = self.x[:have], self.e[:have], self.kind[:have]
         self.x, self.e, self.kind = x, e, kind
-        self.kind0, self.e0 = kind.copy(), e.copy()
+        self.kind0, self.e0, self.before = kind.copy(), e.copy(), x[:0]
         if self.code is None:
             return
         K = k * s
@@ -115,7 +117,7 @@ class Coulomb:
         if self.f is not None:
             self.f.rows = 0
 
-    def solve(self, k: int, W: Array, q: Array, mu: Array, tol: float) -> Array:
+    def solve(self, k: int, W: Array, q: Array, mu: Array, tol: float, first: bool = False) -> Array:
         """Forces x (k, 1 + tangents) of the first k nodes, from the forces and sets of the last call.
 
         Args:
@@ -124,13 +126,14 @@ class Coulomb:
             q: half the gap and half the slip without forces, (k (1 + tangents),) [m].
             mu: coefficients of friction, (k,).
             tol: by how much gaps may be negative, and slips of the wrong sign [m].
+            first: whether a step begins here: from forces that continue those of the last two steps.
 
         Raises SolverError: neither rounds nor sweeps find a solution, nor do pivots or friction that grows.
         """
         if k != len(self.kind):
             self.fit(k)
-        opened = (self.kind == OPEN) & (q[:: 1 + self.m] < 0)
-        self.kind[opened] = STICK
+        if not (first and self._lead(W, q, mu, tol)):
+            self.kind[(self.kind == OPEN) & (q[:: 1 + self.m] < 0)] = STICK
         if not self._attempt(W, q, mu, tol):
             others = (self._pivot, self._grow) if self.m == 1 else (self._grow, self._pivot)
             if not any(other(W, q, mu, tol) for other in others):
@@ -139,6 +142,20 @@ class Coulomb:
                     "less friction"
                 )
         return self.x
+
+    def _lead(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
+        """Forces that continue those of the last two steps, with their sets and directions; whether there were two."""
+        if self.code is None:
+            return False
+        before, self.before = self.before, self.x[: len(self.x) * bool(self.x.any())].copy()
+        if not len(before):
+            return False
+        self.x *= 2
+        self.x -= before
+        self.x[self.kind == OPEN] = 0.0
+        self._describe(W, q, mu, tol)
+        self.code[1].softgrasp_judge(self.f)
+        return True
 
     def _attempt(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
         """Whether rounds and sweeps from the present forces and sets find a solution."""
@@ -204,10 +221,7 @@ class Coulomb:
         return False
 
     def _in_c(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
-        if W is not self.arrays.get("W"):
-            self.forget()
-        self._point(W=W, q=q, mu=mu)
-        self.f.ld, self.f.tol = W.shape[1], tol
+        self._describe(W, q, mu, tol)
         if self._rounds():
             return True
         self.code[1].softgrasp_sweep(self.f, SWEEPS, STILL)
@@ -218,6 +232,13 @@ class Coulomb:
         self.x[:], self.kind[:], self.e[:] = kept
         self.forget()
         return bool(self.code[1].softgrasp_wrong(self.f) <= tol)
+
+    def _describe(self, W: Array, q: Array, mu: Array, tol: float) -> None:
+        """Let the struct have the problem."""
+        if W is not self.arrays.get("W"):
+            self.forget()
+        self._point(W=W, q=q, mu=mu)
+        self.f.ld, self.f.tol = W.shape[1], tol
 
     def _rounds(self) -> bool:
         """Whether Newton's method finds a solution from the present sets."""
@@ -242,7 +263,7 @@ class Coulomb:
         count = 0 if self.f is None else int(self.f.count)
         rows = 0 if self.f is None else int(self.f.rows)
         head = np.array([len(self.kind), rows, count, *self.tally[:2]], dtype=float)
-        parts = self.x, self.kind, self.e, self.kind0, self.e0, self.other[:count]
+        parts = self.x, self.kind, self.e, self.kind0, self.e0, self.other[:count], self.before
         return np.concatenate([head, *(np.asarray(part, dtype=float).ravel() for part in parts)])
 
     def resume(self, numbers: Array, W: Array, mu: Array) -> None:
@@ -251,7 +272,9 @@ class Coulomb:
         s = 1 + self.m
         self.fit(k)
         self.tally[:2] = numbers[3:5]
-        x, kind, e, kind0, e0, other = np.split(numbers[5:], np.cumsum([k * s, k, k * s, k, k * s]))
+        sizes = [k * s, k, k * s, k, k * s, count]
+        x, kind, e, kind0, e0, other, before = np.split(numbers[5:], np.cumsum(sizes))
+        self.before = before.reshape(-1, s)
         self.x[:], self.e[:] = x.reshape(k, s), e.reshape(k, s)
         if self.f is not None and rows:
             self._point(W=W, mu=mu)

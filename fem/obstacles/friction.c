@@ -4,7 +4,7 @@
 
 enum { OPEN, STICK, SLIP };
 enum { SOLVED = 0, WANTED = 1, CYCLED = 2 };
-enum { LATE = 2, PAST = 15 };        /* steps that are kept, at most */
+enum { LATE = 4, PAST = 15 };        /* steps that are kept, at most */
 static const double SLOW = 0.3; /* by how much a round should reduce the residual */
 
 typedef struct {
@@ -65,21 +65,34 @@ void softgrasp_matrix(Rub *f) {
   f->count = 0;
 }
 
-static void back(const Rub *f, double *b) {
+static void back(const Rub *f, double *restrict b) {
   const int K = f->rows;
   for (int j = 0; j < K; j++) {
     const double t = b[f->pivot[j]];
     b[f->pivot[j]] = b[j];
     b[j] = t;
   }
-  for (int j = 0; j < K; j++) {
-    const double t = b[j], *l = f->LU + (size_t)j * K;
-    if (t != 0)
-      for (int i = j + 1; i < K; i++) b[i] -= l[i] * t;
+  int j = 0;
+  for (; j + 4 <= K; j += 4) { /* four columns in a pass */
+    const double *l = f->LU + (size_t)j * K, *l1 = l + K, *l2 = l1 + K, *l3 = l2 + K, t0 = b[j];
+    const double t1 = b[j + 1] -= l[j + 1] * t0;
+    const double t2 = b[j + 2] -= l[j + 2] * t0 + l1[j + 2] * t1;
+    const double t3 = b[j + 3] -= l[j + 3] * t0 + l1[j + 3] * t1 + l2[j + 3] * t2;
+    for (int i = j + 4; i < K; i++) b[i] -= (l[i] * t0 + l1[i] * t1) + (l2[i] * t2 + l3[i] * t3);
   }
-  for (int j = K - 1; j >= 0; j--) {
-    const double *u = f->LU + (size_t)j * K, t = b[j] /= u[j];
+  for (; j < K; j++)
+    for (int i = j + 1; i < K; i++) b[i] -= f->LU[(size_t)j * K + i] * b[j];
+  for (j = K; j > K / 4 * 4;) {
+    const double *u = f->LU + (size_t)--j * K, t = b[j] /= u[j];
     for (int i = 0; i < j; i++) b[i] -= u[i] * t;
+  }
+  while (j > 0) {
+    j -= 4;
+    const double *u = f->LU + (size_t)j * K, *u1 = u + K, *u2 = u1 + K, *u3 = u2 + K, t3 = b[j + 3] /= u3[j + 3];
+    const double t2 = b[j + 2] = (b[j + 2] - u3[j + 2] * t3) / u2[j + 2];
+    const double t1 = b[j + 1] = (b[j + 1] - u3[j + 1] * t3 - u2[j + 1] * t2) / u1[j + 1];
+    const double t0 = b[j] = (b[j] - u3[j] * t3 - u2[j] * t2 - u1[j] * t1) / u[j];
+    for (int i = 0; i < j; i++) b[i] -= (u[i] * t0 + u1[i] * t1) + (u2[i] * t2 + u3[i] * t3);
   }
 }
 
@@ -181,9 +194,27 @@ static void solve(Rub *f, int count, double *b, double *t) {
     for (int c = 0; c < K; c++) b[c] -= t[i] * f->Z[(size_t)i * K + c];
 }
 
+/* y = W x + q; W is larger than the caches, so that only its lower half is read. */
 static void evaluate(const Rub *f) {
   const int K = f->k * (1 + f->m);
-  for (int r = 0; r < K; r++) f->y[r] = f->q[r] + dot(K, f->W + (size_t)r * f->ld, f->x);
+  const double *x = f->x;
+  double *restrict y = f->y;
+  memcpy(y, f->q, K * sizeof(double));
+  for (int r = 0; r < K; r++) {
+    const double *w = f->W + (size_t)r * f->ld, t = x[r];
+    double s[8] = {0};
+    int j = 0;
+    for (; j + 8 <= r; j += 8)
+      for (int l = 0; l < 8; l++) {
+        s[l] += w[j + l] * x[j + l];
+        y[j + l] += w[j + l] * t;
+      }
+    for (; j < r; j++) {
+      s[0] += w[j] * x[j];
+      y[j] += w[j] * t;
+    }
+    y[r] += w[r] * t + (((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7])));
+  }
 }
 
 /* New sets and directions from x and y; whether a set changed. */
@@ -223,6 +254,12 @@ static int classify(Rub *f) {
     f->kind[i] = kind;
   }
   return changed;
+}
+
+/* Sets and directions of forces that were not solved for. */
+void softgrasp_judge(Rub *f) {
+  evaluate(f);
+  classify(f);
 }
 
 /* Residual of the equations of the present sets into b; the largest. */

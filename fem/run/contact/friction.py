@@ -62,7 +62,7 @@ def rubbing_impulse(
     """Impulse with friction (k d,) that stops rows; None where friction would not dissipate energy in the step.
 
     Args:
-        jolt: problem of the impulses, without forces or sets of its own.
+        jolt: problem of the impulses, with room for the rows, and sets to begin from.
         mu: coefficients of friction, (k,).
         A: N M^-1 N' of the rows, a normal and then its tangents, (k d, k d).
         v: velocities along them, (k, d).
@@ -70,9 +70,8 @@ def rubbing_impulse(
     """
     (k, s), before = v.shape, np.ascontiguousarray(v.ravel())
     pushed = contact.dt * np.column_stack([rows.x, rows.x_t])
-    jolt.fit(k)
-    jolt.x[:], jolt.kind[:], jolt.e[:] = pushed, rows.kind, rows.e
-    y = (jolt.solve(k, np.ascontiguousarray(A), before - A @ pushed.ravel(), mu, still) - pushed).ravel()
+    jolt.x[:] = pushed
+    y = (jolt.solve(k, A, before - A @ pushed.ravel(), mu, still) - pushed).ravel()
     taken = (-y * (before + A @ y / 2)).reshape(k, s)
     if taken[:, 1:].sum() - np.einsum("ka,ka->", rows.x_t, rows.slip) < 0:
         return None
@@ -151,7 +150,9 @@ class FrictionContact(Contact):
         if max(np.abs(speed[:, 0]).max(), np.abs(speed[stuck]).max(initial=0.0)) <= still:
             return
         obstacle, node, axes = (np.repeat(rows.obstacle, d := self.d), np.repeat(rows.node, d), along.reshape(-1, d))
-        A = self.strike.reactions().matrix(node, axes)
+        A = np.ascontiguousarray(self.strike.reactions().matrix(node, axes))
+        self.jolt.fit(len(rows.node))
+        self.jolt.kind[:], self.jolt.e[:] = rows.kind, rows.e
         y = rubbing_impulse(self, self.jolt, rows, self.mu[rows.obstacle], A, speed, still)
         if y is None:
             super()._halt(state, n, rows, normal, v, still)
@@ -187,14 +188,42 @@ class FrictionContact(Contact):
         return shape.normal if isinstance(shape, HalfSpace) else np.eye(self.d)[0]
 
 
+class Side:
+    """What every other step continues: steps of the midpoint rule alternate, and with them sets and forces.
+
+    Args:
+        tangents: of a node.
+
+    Attributes:
+        coulomb: problem of the steps.
+        jolt: problem of their impulses.
+        stopped: rows of the last impulse, (k d,).
+        A: N M^-1 N' of these rows, (k d, k d).
+    """
+
+    def __init__(self, tangents: int) -> None:
+        self.coulomb, self.jolt = Coulomb(tangents), Coulomb(tangents)
+        self.stopped, self.A = np.zeros(0, dtype=np.intp), np.zeros((0, 0))
+
+    def stop(self, rows: Ints, A: Array) -> None:
+        """Room for impulses on other rows, of all N M^-1 N'; while they stay, their problem keeps its factor."""
+        self.stopped, self.A = rows, np.ascontiguousarray(A[np.ix_(rows, rows)])
+        self.jolt.fit(len(rows) // (1 + self.jolt.m))
+
+
 class FlatFriction(FlatContact):
     """`FrictionContact` before half-spaces; there must be a compiler."""
 
     def __init__(self, model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> None:
         self.mu = np.array([entry.friction for entry in model.scene.obstacle or []])
         d = 3 if len((model.scene.obstacle or [])[0].normal or []) == 3 else 2
-        self.coulomb, self.jolt = Coulomb(d - 1), Coulomb(d - 1)
+        self.sides = Side(d - 1), Side(d - 1)
         super().__init__(model, midpoint, steps, hand)
+
+    @property
+    def side(self) -> Side:
+        """What the step in work continues."""
+        return self.sides[self.n % 2]
 
     def _basis(self, obstacle: Obstacle) -> Array:
         """See :meth:`Contact._basis`: the normal, then its tangents."""
@@ -209,8 +238,6 @@ class FlatFriction(FlatContact):
     def _enter(self, pairs: Ints) -> None:
         """See :meth:`FlatContact._enter`. Collective."""
         super()._enter(pairs)
-        self.coulomb.fit(len(self._pairs()))
-        self.point(kind=self.coulomb.kind)
         self.friction = self.mu[self._pairs()[:, 0]]
 
     def _fit(self, size: int) -> None:
@@ -218,20 +245,21 @@ class FlatFriction(FlatContact):
 
     def _balance(self, tol: float) -> Array:
         """See :meth:`FlatContact._balance`."""
-        k = self.f.k
-        x = self.coulomb.solve(k // self.d, self.W, self.free[:k], self.friction, tol)
-        self.small.tally[0] = self.coulomb.tally[0]
+        k, coulomb = self.f.k, self.side.coulomb
+        x = coulomb.solve(k // self.d, self.W, self.free[:k], self.friction, tol, self.f.round == 0)
+        self.point(kind=coulomb.kind)
+        self.small.tally[0] = sum(side.coulomb.rounds for side in self.sides)
         return x.ravel()
 
     def _pressed_rows(self) -> RubbingRows:
         s, k = self.d, len(self.row)
         x, on = self.x[:k].reshape(-1, s), np.flatnonzero(self.x[:k:s] > 0)
         obstacle, node = self._pairs()[on].T
-        slip = np.zeros(k)
+        slip, coulomb = np.zeros(k), self.side.coulomb
         self.c.softgrasp_values(self.f, self.ffi.from_buffer("double[]", slip))
         return RubbingRows(
             obstacle, node, self.normals[obstacle], x[on, 0], self.along[obstacle, 1:], x[on, 1:],
-            2 * slip.reshape(-1, s)[on, 1:], self.coulomb.kind[on], self.coulomb.e[on],
+            2 * slip.reshape(-1, s)[on, 1:], coulomb.kind[on], coulomb.e[on],
         )  # fmt: skip
 
     def _halt_flat(self, state: TissueState, v: Any) -> None:
@@ -240,8 +268,11 @@ class FlatFriction(FlatContact):
         on = np.flatnonzero(np.repeat(self.x[:k:s] > 0, s))
         if on[-1] >= self.f.struck:
             self.stops.enter()
-        A, before = self.stops.A[np.ix_(on, on)], -self.rates[on].reshape(-1, s)
-        y = rubbing_impulse(self, self.jolt, rows, self.mu[rows.obstacle], A, before, self.f.still)
+        side, before = self.side, -self.rates[on].reshape(-1, s)
+        if not np.array_equal(on, side.stopped):
+            side.stop(on, self.stops.A)
+            side.jolt.kind[:], side.jolt.e[:] = rows.kind, rows.e
+        y = rubbing_impulse(self, side.jolt, rows, self.mu[rows.obstacle], side.A, before, self.f.still)
         self.struck[:k] = 0.0
         if y is None:
             first = on[::s]
@@ -255,7 +286,8 @@ class FlatFriction(FlatContact):
 
     def _sets(self) -> list[NDArray[Any]]:
         """See :meth:`Contact._sets`."""
-        return [self._pairs().ravel(), self.coulomb.state()]
+        sides = [[side.coulomb.state(), side.stopped, side.jolt.state()] for side in self.sides]
+        return [self._pairs().ravel(), *sides[0], *sides[1]]
 
     def _resume(self, sets: list[Array]) -> None:
         """See :meth:`Contact._resume`. Collective."""
@@ -263,5 +295,8 @@ class FlatFriction(FlatContact):
         if not len(pairs):
             return
         self._enter(pairs)
-        self.coulomb.resume(sets[1], self.W, self.friction)
-        self.point(kind=self.coulomb.kind)
+        for side, coulomb, stopped, jolt in zip(self.sides, sets[1::3], sets[2::3], sets[3::3], strict=True):
+            side.coulomb.resume(coulomb, self.W, self.friction)
+            if len(rows := stopped.astype(np.intp)):
+                side.stop(rows, self.stops.A)
+                side.jolt.resume(jolt, side.A, self.mu[self.row[rows[:: self.d], 0]])

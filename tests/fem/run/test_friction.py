@@ -269,6 +269,35 @@ def floor(friction: float) -> str:
     return f"obstacle=[{{kind='halfspace', normal=[0, 0, 1], offset=-0.0001, friction={friction}}}]"
 
 
+@pytest.mark.parametrize("until", [1, 2, 25])  # after the first touch, with one and both sides, and in sliding
+def test_restart_in_three_dimensions_repeats_the_bits_on_both_sides(until: int, mpi_tmp_path: Path) -> None:
+    moves = "motion={profile='quintic', target=[0.02, 0.01, -0.001], duration=0.3}"
+    overrides = [*BLOCK, floor(0.3), "effects.reaction=false", moves, "time.steps=60", "time.end=0.3"]
+    whole = simulate(build("block_3d", overrides))
+    with pytest.raises(Paused):
+        simulate(build("block_3d", overrides), RunOptions(mpi_tmp_path, until=until))
+    again = simulate(build("block_3d", overrides), RunOptions(mpi_tmp_path, resume=True))
+    assert whole.contact.touching[:until].max() > 0
+    assert whole.contact.impulse[until:].any()
+    assert np.array_equal(again.final, whole.final)
+    assert np.array_equal(again.contact.force, whole.contact.force)
+    assert again.contact.rounds == whole.contact.rounds
+
+
+def test_forces_that_continue_two_steps_solve_the_next_in_fewer_rounds() -> None:
+    """Loads on a line, from whose second step forces are known but for sets that change and directions that turn."""
+    rng, k = np.random.default_rng(5), 30
+    A, base, more = rng.standard_normal((92, 90)), rng.standard_normal(90), 0.01 * rng.standard_normal(90)
+    W, mu, counts = A.T @ A / k + 3 * np.eye(90), np.full(k, 0.3), []
+    for first in (False, True):
+        coulomb = Coulomb(2)
+        for n in range(12):
+            x = coulomb.solve(k, W, load := base + n * more, mu, 1e-13, first)
+            check_law(x, W, load, 0.3)
+        counts.append(coulomb.rounds)
+    assert counts[1] < 0.7 * counts[0]  # measured: 84 of 130
+
+
 def test_in_three_dimensions_sliding_starts_at_mu_times_the_weight() -> None:
     """A force of slowly growing size, 37 degrees from an axis: the table answers along it, first with mu N."""
     mu, steps, settle, ramp, way = 0.5, 700, 0.6, 1.0, np.array([0.8, 0.6, 0.0])
