@@ -105,10 +105,21 @@ CASES: tuple[tuple[str, str, tuple[str, ...], bool], ...] = (
     ("friction of 100 on a slope", "{kind='halfspace', normal=[0.3, 1], offset=-0.03, friction=100.0}", (), True),
     ("finite strain, block falls on a corner", "{kind='halfspace', normal=[0.3, 1], offset=-0.03}",
      ("effects.finite_strain={}",), True),
+    ("three equal tables with friction", ", ".join([TABLE.replace("}", ", friction=0.3}")] * 3), (), True),
+    ("slit 0.1 narrower on each side", f"{box(-2, -1.03, 2.1, 1)}, {box(0.9, -1.03, 2, 1)}", (), True),
+    ("table that drops away", "{kind='halfspace', normal=[0, 1], offset=-0.01, path={velocity=[0, -0.2]}}",
+     ("time.start='equilibrium'",), True),
+    ("free hand of 1e-6 of the body's mass", TABLE,
+     ("effects.reaction=true", "hand={mass=2e-6}", "motion={profile='hold', drive='force'}",
+      "effects.gravity={g=[0, -5], hand_weight=true}"), True),
+    ("layers of stiffness 1e4 apart", TABLE,
+     ("tissue.layers={stiff={box=[[0, 0], [1, 0.5]], material={young=1.25e6, poisson=0.3, rho=1.0}}}",), True),
+    ("nu = 0.4999, P2", TABLE, ("tissue.order=2", "tissue.material={young=125.0, poisson=0.4999, rho=1.0}"), True),
+    ("1e5 steps, undamped", TABLE, ("time.steps=100000", "time.end=100.0", "effects.damping=false"), True),
     ("steps of Courant number 10", TABLE, ("time.steps=20", "time.end=4.0"), True),
     ("steps of Courant number 0.01", TABLE, ("time.steps=5000",), True),
 )  # fmt: skip
-SLOW = ("steps of Courant number 0.01",)
+SLOW = ("steps of Courant number 0.01", "1e5 steps, undamped")
 PERIOD = 0.1  # of the vibrating table [s]
 NO_ROOM = "no state of the body fits, or a step is too long to see the obstacle"
 
@@ -141,7 +152,11 @@ def contact_rows(quick: bool) -> Iterator[HardCase]:
     with tempfile.TemporaryDirectory() as folder:
         model = make("paper_forward", *BODY, *vibrating(Path(folder), bounces))
         balance, soft = here(ours, model, bounces - 1), textbook(springs, model)
+        (file := Path(folder) / "broken.csv").write_text("t,x,y\n0,0,0\n0.5,0,nan\n1,0,0.1\n")
+        model = make("paper_forward", *BODY, *RUN, f"obstacle=[{TABLE[:-1]}, path={{csv='{file}'}}}}]")
+        refused, passed = here(ours, model), textbook(springs, model)
     yield HardCase(f"{bounces} bounces", len(CASES) + 1.0, balance, soft, BOUND, REASON)
+    yield HardCase("path that is not a number", len(CASES) + 2.0, refused, passed, None, "a place must be a number")
 
 
 FAMILIES = (
