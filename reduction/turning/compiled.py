@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,6 @@ from softgrasp.fem.obstacles.compiled import HEADERS, RIDGE
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.strain.compiled import library
 
-if TYPE_CHECKING:
-    from softgrasp.reduction.turning.stepper import TurningSteps
-
 SOURCE = Path(__file__).with_name("free.c")
 FUNCTION = "int softgrasp_free(const Free *t);"
 
@@ -23,11 +20,11 @@ FUNCTION = "int softgrasp_free(const Free *t);"
 class FreeStep:
     """The struct of `free.c` with the matrices of a run.
 
-    ``compiled``: ffi and functions of the library; ``steps`` and ``balance`` have the matrices; ``most``, ``tol`` are
-    those of the iteration.
+    ``compiled``: ffi and functions of the library; ``steps`` (`TurningSteps`) and ``balance`` have the matrices;
+    ``most`` and ``tol`` are those of the iteration.
     """
 
-    def __init__(self, compiled: Any, steps: TurningSteps, balance: HandBalance, most: int, tol: float) -> None:
+    def __init__(self, compiled: Any, steps: Any, balance: HandBalance, most: int, tol: float) -> None:
         self._ffi, self._code = compiled
         self._struct, self._arrays = self._ffi.new("Free *"), dict[str, Array]()
         small, k, d = steps.small, len(steps.a), steps.d
@@ -43,7 +40,7 @@ class FreeStep:
         )  # fmt: skip
 
     @classmethod
-    def of(cls, steps: TurningSteps, balance: HandBalance, most: int, tol: float) -> FreeStep | None:
+    def of(cls, steps: Any, balance: HandBalance, most: int, tol: float) -> FreeStep | None:
         """For a run whose matrices are there; None, with a warning, without a compiler."""
         code = SOURCE.read_text()
         declaration = code[code.index("typedef struct {") : code.index("} Free;")] + "} Free;\n" + FUNCTION
