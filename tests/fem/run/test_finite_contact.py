@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softgrasp.fem.errors import Paused
+from softgrasp.fem.errors import Paused, SceneError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import RunOptions, simulate
 
@@ -79,3 +79,15 @@ def test_table_and_hand_carry_the_weight_at_rest() -> None:
     weight = build("paper_forward", FALL).system.M_rigid[1, 1] * 5
     assert result.force[-1, 1] + result.contact.force[-1, 0, 1] == pytest.approx(weight, rel=1e-5)  # left of the motion
     assert result.contact.force[-1, 0, 1] > 0.05 * weight
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["effects.reaction=true", "hand={mass=2.0}"], "effects.reaction cannot go with effects.obstacles at finite"),
+        (["time.start='equilibrium'"], "time.start is 'equilibrium'; with effects.obstacles and effects.finite_strain"),
+    ],
+)
+def test_what_contact_at_finite_strain_cannot_do_is_refused(overrides: list[str], words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        build("paper_forward", [*FALL, ON, table(-0.03), *overrides])

@@ -347,6 +347,8 @@ REFUSED = [
                   "{kind='disc', center=[9, 9], radius=0.1, parts=4}]"],
      "obstacle.1.parts cannot go with the friction of another obstacle"),
     ("paper_forward", [*SMALL, table(-1.0)], "friction"),
+    ("paper_forward", [*SMALL, table(0.2), "effects.finite_strain={}"],
+     "obstacle has friction, which effects.finite_strain does not have yet; drop friction"),
 ]  # fmt: skip
 
 

@@ -20,7 +20,9 @@ from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.certified.archive import load_certified
 from softgrasp.reduction.contact.model import ContactModel
 from softgrasp.reduction.system import ModelError
+from softgrasp.study.reduce.contact.measure import measure_contact
 from softgrasp.study.reduce.run import run_reduce
+from softgrasp.study.reduce.times import measured_run
 
 SMALL = ["tissue.cells=[6, 4]", "time.steps=200"]
 
@@ -55,6 +57,20 @@ def test_numbers_are_those_of_the_saved_models(tmp_path: Path) -> None:
     page = (out / "report.html").read_text()
     assert "No certificate covers contact" in page
     assert (out / "force.png").stat().st_size > 1000
+
+
+@pytest.mark.ranks(3)
+def test_every_rank_count_gives_the_same_errors() -> None:
+    studies = []
+    for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
+        model = sg.build("set_down", [*SMALL, "time.steps=100", "reduction.N=[12]"], comm=comm)
+        studies.append(measure_contact(*measured_run(model, lambda *_: None), lambda *_: None))
+    (one,), (every,) = (list(study.points.values()) for study in studies)
+    assert one.N == every.N == 12
+    for key in ("error", "error_force", "error_held_out", "error_force_held_out"):
+        assert getattr(every, key) == pytest.approx(getattr(one, key), rel=1e-5), key  # rounding over the error, 1e-4
+    for a, b in zip(*(study.motions for study in studies), strict=True):
+        assert a.touching == b.touching > 0.1
 
 
 @pytest.mark.parametrize(
