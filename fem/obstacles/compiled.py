@@ -25,6 +25,14 @@ def contact_library() -> Any:
     return compiled(SOURCE, code[code.index("typedef struct {") :] + DECLARATIONS)
 
 
+def friction_library() -> Any:
+    """See `compiled`, of `friction.c`."""
+    source = SOURCE.with_name("friction.c")
+    code = source.read_text()
+    struct = code[code.index("typedef struct {") : code.index("} Rub;")] + "} Rub;\n"
+    return compiled(source, struct + RUB_DECLARATIONS)
+
+
 DONE, TAKE, ENTER, BALANCE, SOLVE, UNSOLVED, UNSETTLED = range(7)  # what a step needs before it goes on
 DECLARATIONS = """
 int softgrasp_complement(int p, int ld, const double *W, const double *q, double tol, int most,
@@ -36,4 +44,12 @@ int softgrasp_step(Flat *f, int n);
 int softgrasp_finish(Flat *f, int n, const double *v);
 void softgrasp_strike(const Flat *f, int n, double *v);
 int softgrasp_stop(Flat *f, int n, double *v);
+"""
+RUB_DECLARATIONS = """
+void softgrasp_matrix(Rub *f);
+void softgrasp_units(Rub *f);
+void softgrasp_judge(Rub *f);
+int softgrasp_rub(Rub *f, int begin, int rounds);
+void softgrasp_sweep(Rub *f, int sweeps, double still);
+double softgrasp_wrong(Rub *f);
 """

@@ -14,7 +14,6 @@ grows. `friction.c` does so; without a compiler NumPy takes the same rounds, eac
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dgetrf
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.obstacles.compiled import RIDGE, compiled
+from softgrasp.fem.obstacles.compiled import RIDGE, friction_library
 
 Array = NDArray[Any]
 OPEN, STICK, SLIP = range(3)
@@ -35,22 +34,6 @@ GROWTH, LEAST = 1.4, 1.04  # by how much it does, and by how much it must
 REFINED = 6  # pyramids, each with edges three times as near to the last directions
 NEARLY = 1e-9  # of a force, below which its node slips, or is open [1]
 SOLVED, WANTED = 0, 1  # what `softgrasp_rub` says; else the rounds lead nowhere
-SOURCE = Path(__file__).with_name("friction.c")
-DECLARATIONS = """
-void softgrasp_matrix(Rub *f);
-void softgrasp_units(Rub *f);
-void softgrasp_judge(Rub *f);
-int softgrasp_rub(Rub *f, int begin, int rounds);
-void softgrasp_sweep(Rub *f, int sweeps, double still);
-double softgrasp_wrong(Rub *f);
-"""
-
-
-def friction_library() -> Any:
-    """(ffi, library) of `friction.c`, or None with a warning where it cannot be compiled."""
-    code = SOURCE.read_text()
-    struct = code[code.index("typedef struct {") : code.index("} Rub;")] + "} Rub;\n"
-    return compiled(SOURCE, struct + DECLARATIONS)
 
 
 class Coulomb:

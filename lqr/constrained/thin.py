@@ -93,8 +93,9 @@ def thinned(order: Order, v: Array, seen: Array, reach: Array, whole: Array, mos
     """
     instants, count = v.shape
     found: list[int] = []
-    mean = np.zeros((instants, count, 0))  # of every node, by those found
-    least, spread = np.zeros((instants, 0)), np.zeros((instants, 0, seen.shape[1]))
+    mean: Array = np.zeros((instants, count, 0))  # of every node, by those found
+    least: Array = np.zeros((instants, 0))
+    spread: Array = np.zeros((instants, 0, seen.shape[1]))
     for j, about, means in zip(order.nodes.tolist(), order.about, order.means, strict=True):
         w = np.einsum("mp,ipa->ima", means, mean[:, about, : len(found)])
         d = np.einsum("ima,ia->im", w, v[:, found]) - v[:, j, None]

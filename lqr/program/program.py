@@ -95,9 +95,9 @@ class Program:
         """From :meth:`arrays`. Raises KeyError: one is missing."""
         if "spread" not in arrays:  # saved when every row stood for itself alone
             most, leaves = arrays["most"], arrays["leaves"]
-            none = {"spread": np.zeros_like(leaves), "instant": np.zeros(len(leaves), dtype=np.int64)}
+            none: dict[str, Any] = {"spread": np.zeros_like(leaves), "instant": np.zeros(len(leaves), dtype=np.int64)}
             reach = np.zeros((len(most), most.shape[1] + 1, most.shape[2]))
-            arrays = arrays | none | {"reach": reach, "between": np.zeros(most.shape[2])}
+            arrays = {**arrays, **none, "reach": reach, "between": np.zeros(most.shape[2])}
         values: dict[str, Any] = {field.name: arrays[field.name] for field in fields(cls)}
         return cls(**values | {"price": float(values["price"]), "every": int(values["every"])})
 
