@@ -1,7 +1,7 @@
 """Rows of a program that others imply: a node between others moves nearly as they do.
 
-All nodes hear the hand alike. In the half-space of one interval node j keeps, with means of others of weights w_a >= 0
-and sum 1, and n.S_j its row of the modes,
+The hand moves all nodes alike. In the half-space of one interval the row of node j is left with, for weights w_a >= 0
+of other nodes with sum 1, and n.S_j its row of the modes,
 
     left_j >= sum_a w_a left_a - d_j - c_j.z,    d_j = sum_a w_a v_a - v_j,    c_j = |n.(S_j - sum_a w_a S_a)|,
 

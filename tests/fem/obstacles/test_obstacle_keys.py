@@ -18,9 +18,9 @@ TABLE = "kind='halfspace', normal=[0, 2], offset=-0.05"
 REFUSED = [
     ("{normal=[0, 1], offset=0}", "obstacle.0.kind is missing; give shape, disc and polygon in 2D"),
     ("{kind='wall'}", "obstacle.0.kind is \"wall\"; it must be 'halfspace', 'disc'"),
-    ("{kind='halfspace', normal=[0, 1]}", "obstacle.0.offset is missing; a halfspace takes normal and offset"),
+    ("{kind='halfspace', normal=[0, 1]}", "obstacle.0.offset is missing; a halfspace needs normal and offset"),
     ("{kind='halfspace', normal=[0, 0], offset=1}", "obstacle.0.normal is [0.0, 0.0]; it must have a direction"),
-    (f"{{{TABLE}, radius=1}}", "obstacle.0.radius does not go with kind = 'halfspace'; a halfspace takes"),
+    (f"{{{TABLE}, radius=1}}", "obstacle.0.radius does not go with kind = 'halfspace'; a halfspace needs"),
     (f"{{{TABLE}, raduis=1}}", "obstacle.0.raduis is not a key; did you mean obstacle.0.radius?"),
     ("{kind='disc', center=[0, 9, 1], radius=1}", "obstacle.0.center has a vector of 3 entries; it must have 2"),
     ("{kind='ball', center=[0, 9, 1], radius=1}", "obstacle.0.kind is 'ball', of 3D; in this 2D scene use 'disc'"),

@@ -301,7 +301,7 @@ def test_a_changed_csv_does_not_resume(comm: MPI.Intracomm, mpi_tmp_path: Path) 
     with pytest.raises(CheckpointError, match="a file that the scene names is not what it was"):
         simulate(small(comm, *csv), RunOptions(directory=mpi_tmp_path, resume=True))
     write("nan")
-    with pytest.raises(SceneError, match="holds nan as column 2, at t = 3 s, in data row 3"):
+    with pytest.raises(SceneError, match="has nan as column 2, at t = 3 s, in data row 3"):
         simulate(small(comm, *csv))
 
 
@@ -329,7 +329,7 @@ def test_streamed_snapshots_of_another_stride_do_not_resume(comm: MPI.Intracomm,
     hdf5 = 'output.snapshots="hdf5"'
     with pytest.raises(Interrupted):
         simulate(small(comm, hdf5), RunOptions(directory=mpi_tmp_path, until=20))
-    with pytest.raises(CheckpointError, match=r"holds \(41, .* needs \(21, "):
+    with pytest.raises(CheckpointError, match=r"has \(41, .* needs \(21, "):
         simulate(small(comm, hdf5, "output.every=2"), RunOptions(directory=mpi_tmp_path, resume=True))
 
 

@@ -151,7 +151,7 @@ TABLES: dict[str, tuple[bytes, str]] = {
     "ragged": (b"0,0\n1\n", "has 1 entries in data row 2; it must have 2 columns"),
     "wide": (b"0,0,0\n1,1,1\n", "has 3 entries in data row 1"),
     "large": (b"0,0\n1,1e300\n", "has 1e+300 as column 2, at t = 1 s, in data row 2"),
-    "infinite": (b"0,0\n1e999,1\n", "holds inf as the time in data row 2"),
+    "infinite": (b"0,0\n1e999,1\n", "has inf as the time in data row 2"),
     "words": (b"0,0\n1,abc\n", "not a number in data row 2"),
     "first": (b"0,abc\n1,1\n", "not a number in data row 1"),
     "field": (b'0,0\n1,"' + b"x" * 200_000 + b'"\n', "is no CSV table"),
