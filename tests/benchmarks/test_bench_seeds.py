@@ -35,8 +35,8 @@ def test_the_truth_outside_of_the_errors_is_counted(monkeypatch: pytest.MonkeyPa
     wrong = bench.measure("small", 3, SMALL)
     assert (wrong.once, wrong.twice, wrong.refused) == (0, 0, 3)
     assert not any(goal.ok for goal in bench.goals_of([wrong]))
-    silent = replace(found, strained=True, spoken=2)
-    assert [goal.ok for goal in bench.goals_of([silent, replace(silent, spoken=3)])] == [False, True]
+    silent = replace(found, strained=True, warned=2)
+    assert [goal.ok for goal in bench.goals_of([silent, replace(silent, warned=3)])] == [False, True]
 
 
 @pytest.mark.slow
@@ -45,7 +45,7 @@ def test_the_truth_is_within_twice_the_errors(name: str) -> None:
     """The first seeds; `python -m benchmarks seeds` takes a hundred."""
     found = bench.measure(name, 20)
     if found.strained:
-        assert found.spoken == 20, found
+        assert found.warned == 20, found
         return
     assert found.twice >= 19, found  # 99 % of the counts of 95 % or more are 17 and above, those measured were 20
     assert found.refused <= 2, found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -15,7 +14,6 @@ import pytest
 from petsc4py import PETSc
 
 import softgrasp as sg
-from softgrasp.fem.errors import SoftgraspError
 from softgrasp.lqr.dense import modal
 from softgrasp.lqr.dense.paper import paper_form
 from softgrasp.lqr.design.scene import weight
@@ -29,6 +27,7 @@ from softgrasp.lqr.plant.checks import check_weights
 from softgrasp.lqr.plant.second_order import second_order
 from softgrasp.lqr.reduced.bases import make_family
 from softgrasp.lqr.reduced.retune import Retuner
+from tests.helpers.sentences import refused
 
 pytestmark = pytest.mark.serial
 Act = Callable[[Path, pytest.MonkeyPatch], Any]
@@ -144,6 +143,5 @@ SENTENCES: list[tuple[Act, str]] = [
 
 @pytest.mark.parametrize(("act", "sentence"), SENTENCES, ids=[sentence[:40] for _, sentence in SENTENCES])
 def test_sentence_names_what_is_wrong(act: Act, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises((SoftgraspError, ValueError), match=re.escape(sentence)) as caught:
+    with refused(sentence):
         act(tmp_path, monkeypatch)
-    assert "\n" not in str(caught.value).strip()

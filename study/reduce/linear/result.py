@@ -36,7 +36,7 @@ class Point:
     error_energy: float  # largest error of the tissue's energy over its largest value
     projection_error_deformation: float  # least ``error_deformation`` of any state in the basis
     projection_error: float  # least ``error`` of any state in the basis
-    time_offline: float  # basis and projection; one factorisation of the snapshots serves all N
+    time_offline: float  # processor time of basis and projection [s]; one factorisation of the snapshots serves all N
     time_setup: float  # what a new parameter costs before its run: small matrices, test of stability, propagator
     time_online: float  # a whole run
     spectral_abscissa: float  # largest real part of an eigenvalue
