@@ -48,6 +48,7 @@ _FORMS = {
     "tissue.refine": "refine = { tolerance = 1e-2 }",
     "contact.sides": 'sides = ["left", "right"]',
     "contact.box": "box = [[0, 0.09], [0.06, 0.12]]",
+    "hand.inertia": "inertia = 1e-3, or in 3D inertia = [1e-3, 1e-3, 5e-4] about x, y and z",
     "motion.target": "target = [0.3, 0.2]",
     "obstacle": 'obstacle = [{ kind = "halfspace", normal = [0, 1], offset = -0.05 }]',
     "control.outputs": 'outputs = [{ kind = "node", point = [0.03, 0] }]',

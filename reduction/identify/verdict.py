@@ -104,7 +104,7 @@ def reasons(
     found = []
     if residuals.misfit > residuals.limit:
         found.append(
-            f"The misfit is {residuals.misfit:.3g} sigma, and chance leaves at most {residuals.limit:.3g}: the model "
+            f"The misfit is {residuals.misfit:.4g} sigma, and chance leaves at most {residuals.limit:.4g}: the model "
             "lacks something that the data show, or the noise is larger than stated."
         )
     if unsettled:

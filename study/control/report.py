@@ -335,9 +335,10 @@ def sections(study: ControlStudy, notes: Sequence[Section], result: Section, dra
 
         planned = plan_sections(study.planned, drawn)
     parts = [
+        *planned[:1],
         Section("", figures=pick("move.png", "move.gif")),
         *notes,
-        *planned,
+        *planned[1:],
         *_observed(study),
         *touching_sections(study, pick("contact.png")),
         replace(result, figures=pick("histories.png", "decay.png")),

@@ -112,6 +112,8 @@ class Simulation:
         """The short table of a run as label and text."""
         run, seconds, steps = self.run, self.run.seconds, self.scene.time.steps
         loads = [f"{c.axis} {self.force_peak[c.axis]:.4g} {c.load_unit}" for c in self.hand()]
+        step = seconds["per_step"]
+        each = f"{1e6 * step:.4g} us" if step < 1e-3 else f"{1e3 * step:.4g} ms"
         timed = f"{steps}" if run.steps_timed == steps else f"{run.steps_timed} of {steps}, since the run was resumed,"
         return [
             ("hand at the end", "(" + ", ".join(f"{x:.6g}" for x in run.q_s[-1]) + ")"),
@@ -125,7 +127,7 @@ class Simulation:
             ("solver", f"{run.solver.name}, by {run.solver.package}"),
             ("", run.solver.reason),
             ("mesh, assembly, factor", ", ".join(f"{seconds[key]:.3g} s" for key in ("mesh", "assembly", "factor"))),
-            ("steps", f"{timed} in {seconds['steps']:.3g} s, {1e6 * seconds['per_step']:.4g} us each"),
+            ("steps", f"{timed} in {seconds['steps']:.3g} s, {each} each"),
             ("peak memory, all ranks", f"{self.memory_peak_mb:.0f} MiB"),
         ]
 

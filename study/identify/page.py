@@ -139,7 +139,7 @@ def fit_rows(answer: Identified) -> list[tuple[str, str]]:
     return [
         ("numbers", f"{r.count} of {in_words(labels(answer.columns))}, in {len(answer.data)} experiment(s)"),
         ("mesh", f"n_e = {answer.model.system.layout.n_e}, {answer.scene.time.steps} time steps, those of fitted.toml"),
-        ("misfit", f"{r.misfit:.3g} sigma, by chance at most {r.limit:.3g}"),
+        ("misfit", f"{r.misfit:.4g} sigma, by chance at most {r.limit:.4g}"),
         ("white", f"correlation of neighbours {r.lag:+.2g}, probability by chance {max(r.white, 1e-15):.2g}"),
         ("outliers", f"{r.outliers} above 4 sigma"),
         *([("correlation", ", ".join(pairs))] if pairs else []),

@@ -240,10 +240,11 @@ def _time(t: float) -> str:
 
 
 def place(q: Array) -> str:
-    """Where the hand is, under the time, in two digits."""
-    x = q[:3]
-    near = np.abs(x) < max(1e-3 * float(np.abs(x).max()), 1e-5)
-    return f"\nat ({', '.join(f'{v:.2g}' for v in np.where(near, 0.0, x))}) m"
+    """Where the hand is, under the time, in two digits; in mm below 1 m, so that captions of panels do not meet."""
+    x, largest = q[:3], float(np.abs(q[:3]).max())
+    factor, unit = (1e3, "mm") if largest < 1 else (1.0, "m")
+    shown = np.where(np.abs(x) < max(1e-3 * largest, 1e-5), 0.0, factor * x)
+    return f"\nat ({', '.join(f'{float(f"{v:.2g}"):g}' for v in shown)}) {unit}"
 
 
 def _upright(move: MoveView) -> bool:

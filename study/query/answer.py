@@ -55,7 +55,7 @@ class CertifiedAnswer:
     def parameters(self) -> str:
         """Numbers of the first layer in words."""
         first = self.materials[0]
-        return f"lambda = {first.lam:g} Pa, mu = {first.mu:g} Pa, rho = {first.rho:g} kg/m^3"
+        return f"lambda = {first.lam:g} Pa, mu = {first.mu:g} Pa, rho = {first.rho:g} kg/m3"
 
     @property
     def shown(self) -> ReducedTrajectory | Trajectory:

@@ -7,7 +7,7 @@ from typing import Any
 
 from softgrasp.reduction import NORMS, Certificate, ParameterDomain
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult, answer_rows
-from softgrasp.study.report import Page, Section, Table, captioned, in_words, percent
+from softgrasp.study.report import Page, Section, Share, Table, captioned, in_words, percent
 from softgrasp.study.shell import Session
 
 CAPTIONS = {
@@ -69,11 +69,11 @@ def box_text(box: ParameterDomain) -> str:
 
 def error_table(c: Certificate) -> Table:
     """The three errors of an answer and what each is."""
-    mesh = c.mesh.largest if c.mesh is not None else None
+    mesh = None if c.mesh is None else Share(c.mesh.largest)
     rows = [
-        ("reduction", c.reduction, c.how, f"the {c.what}"),
-        ("time step", c.time_step, "estimated", f"the {NORMS['energy']}"),
-        ("mesh", mesh, "estimated" if mesh is not None else "not known", "the deformation at the outputs"),
+        ("reduction", Share(c.reduction), c.how, f"the {c.what}"),
+        ("time step", None if c.time_step is None else Share(c.time_step), "estimated", f"the {NORMS['energy']}"),
+        ("mesh", mesh, "not known" if mesh is None else "estimated", "the deformation at the outputs"),
     ]
     return Table(("error of the", "at most or about", "it is", "relative to"), rows, "Errors")
 

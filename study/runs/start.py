@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softgrasp.fem import LIBRARY, SceneError, load_scene, scene_schema
+from softgrasp.fem.errors import MeshError
 from softgrasp.study.report import Table
 
 if TYPE_CHECKING:
@@ -75,11 +76,14 @@ def new_scene(file: Path, *, solid: bool = False, mesh: Path | None = None) -> l
         from softgrasp.fem import _stack  # noqa: F401  MPI before DOLFINx
         from softgrasp.fem.mesh.file import load_arrays
 
-        arrays = load_arrays(mesh, 1.0, repair=False)
+        try:
+            arrays, repair = load_arrays(mesh, 1.0, repair=False), ""
+        except MeshError:  # another fault than inverted cells is raised again
+            arrays, repair = load_arrays(mesh, 1.0, repair=True), "\nrepair = true # turns the inverted cells round"
         scale = 1e-3 if np.ptp(arrays.points, axis=0).max() > LARGEST else 1.0
         points = scale * arrays.points
         lower, upper, tip = points.min(axis=0), points.max(axis=0), points[points[:, -1].argmin()]
-        tissue = _mesh_lines(mesh, file, scale, float(np.ptp(arrays.points, axis=0).max()))
+        tissue = _mesh_lines(mesh, file, scale, float(np.ptp(arrays.points, axis=0).max())) + repair
         sides, layers = _facet_line(arrays), _layer_tables(arrays)
     d, body = len(upper), f"The body of {mesh.name}" if mesh else f"A {'block' if solid else 'strip'} of muscle"
     top = np.append(lower[:-1], upper[-1] - (0.1 if mesh else 0.25) * (upper[-1] - lower[-1]))

@@ -18,7 +18,7 @@ from mpi4py import MPI
 from rich.console import Console
 
 import softgrasp as sg
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.owned import LIST
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.fem.scene.scene import scene_schema
@@ -183,6 +183,20 @@ def test_a_new_scene_runs_and_fits_its_schema(tmp_path: Path, kind: str) -> None
         new_scene(file)
     with pytest.raises(SceneError, match=r"name it my\.toml"):
         new_scene(tmp_path / "my.txt")
+
+
+@pytest.mark.serial
+def test_a_new_scene_turns_inverted_cells_round(tmp_path: Path) -> None:
+    """The mesh alone is refused, and there is no scene yet in which `tissue.repair` could be set."""
+    points = np.array([[0.0, 0.0], [0.04, 0.0], [0.04, 0.08], [0.0, 0.08]])
+    meshio.write(tmp_path / "strip.vtu", meshio.Mesh(points, [("triangle", [[0, 2, 1], [0, 2, 3]])]))
+    scene = sg.load_scene(new_scene(tmp_path / "my.toml", mesh=tmp_path / "strip.vtu")[0])
+    assert scene.tissue.repair
+    mass = sg.build(scene).system.M_rigid[0, 0]  # of the whole strip, as if no cell had been inverted
+    assert mass == pytest.approx(1060.0 * 0.04 * 0.08)  # rho of muscle [kg/m3] and 1 m of thickness
+    meshio.write(tmp_path / "flat.vtu", meshio.Mesh(points, [("triangle", [[0, 2, 1], [0, 1, 1]])]))
+    with pytest.raises(MeshError, match="zero volume"):
+        new_scene(tmp_path / "other.toml", mesh=tmp_path / "flat.vtu")
 
 
 @pytest.mark.serial

@@ -14,6 +14,7 @@ from softgrasp.lqr import Plan
 from softgrasp.lqr.design.constrained import FinitePlan
 from softgrasp.study.control.obstacle.result import PlannedStudy
 from softgrasp.study.report import Section, Table, captioned, in_words, percent
+from softgrasp.study.report.document import number
 
 CAPTIONS = {
     "obstacle.png": "The boundary of the body on the full plant under the plan, and the way of its middle; grey and "
@@ -32,7 +33,7 @@ GAPS = ("obstacle", "least gap [m]", "at [s]", "without the plan [m]")
 
 
 def plan_sections(study: PlannedStudy, drawn: Sequence[Path]) -> list[Section]:
-    """Gaps, margins and costs with the pictures."""
+    """The way past the obstacles, as the first picture of the page; gaps, margins and costs with the others."""
     runs = study.planned.runs
     gaps = [
         (name, least, at, free)
@@ -41,7 +42,10 @@ def plan_sections(study: PlannedStudy, drawn: Sequence[Path]) -> list[Section]:
             runs.free.least.tolist(), strict=True,
         )
     ]  # fmt: skip
-    parts = [Section("Plan", sentence(study), rows=facts(study), figures=captioned(drawn, CAPTIONS), terminal=True)]
+    figures = captioned(drawn, CAPTIONS)
+    way = [each for each in figures if each[0].name == "obstacle.png"]
+    others = [each for each in figures if each not in way]
+    parts = [Section("", figures=way), Section("Plan", rows=facts(study), figures=others, terminal=True)]
     if gaps:
         text = (
             f"Distance of {'body' if study.named is None else 'these nodes'} and obstacle on the full plant at every "
@@ -166,7 +170,8 @@ def _noisy(study: PlannedStudy) -> list[tuple[str, str]]:
         (
             "program online",
             f"{program.count(0)} of {study.rows} rows, which imply all that can become active; "
-            f"{np.median(seconds):.2g} ms in the median and {seconds.max():.2g} ms at most in Python, with its check",
+            f"{number(np.median(seconds))} ms in the median and {number(seconds.max())} ms at most in Python, with its "
+            "check",
         ),
     ]
 
