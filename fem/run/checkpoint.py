@@ -27,6 +27,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.shown import counted
 
 FORMAT = 7
+FRICTION = 2  # form of the sets of friction in them
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # keys of [output] that change no number of a run
 FREE = ("name", "description", "reduction", "study")
 OLD = ("*step*-rank*", "*frame*.npz")  # patterns of the files that a new manifest makes useless
@@ -106,6 +107,7 @@ def _write_manifest(state: RestartState, scene: Scene, manifest: Path, files: li
         "legs": state.legs,
         "files": files,
         "beside": state.beside,
+        **({"friction": FRICTION} if _rubs(scene) else {}),
     }
     try:
         write_manifest(manifest, entry)
@@ -160,6 +162,11 @@ def _fitting(scene: Scene, ranks: int, manifest: Path, entry: dict[str, Any]) ->
     """
     _same_ranks(manifest, entry, ranks)
     if entry["scene_hash"] == _numbers_hash(scene):
+        if _rubs(scene) and entry.get("friction") != FRICTION:
+            raise CheckpointError(
+                f"{manifest} was written by another version of softgrasp, which continues friction in another form; "
+                f"{AGAIN}"
+            )
         return entry
     before, now = _flat(entry["scene"]), _flat(scene.model_dump(mode="json", by_alias=True))
     keys = [*now, *(key for key in before if key not in now)]
@@ -173,6 +180,11 @@ def _fitting(scene: Scene, ranks: int, manifest: Path, entry: dict[str, Any]) ->
         f"a file that the scene names is not what it was when {manifest} was written; put the old one back, or run "
         "again without --resume"
     )
+
+
+def _rubs(scene: Scene) -> bool:
+    """Whether a run of the scene keeps sets of friction."""
+    return bool(scene.effects.obstacles) and any(entry.friction for entry in scene.obstacle or [])
 
 
 def _numbering(layout: BlockLayout) -> Array:

@@ -268,6 +268,8 @@ class FlatContact(Contact):
     def _resume(self, sets: list[Array]) -> None:
         """See :meth:`Contact._resume`. Collective."""
         rows, order, L = sets
+        if not len(rows):
+            return
         self._enter(rows.reshape(-1, 2).astype(int))
         self.small.resume(order.astype(int), L, len(self.W))
         self._fit(len(self.W))

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from softgrasp.fem.errors import Paused, SceneError, SolverError
+from softgrasp.fem.checksums import read_manifest, write_manifest
+from softgrasp.fem.errors import CheckpointError, Paused, SceneError, SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.obstacles.coulomb import Coulomb
 from softgrasp.fem.obstacles.lemke import pyramid_forces
+from softgrasp.fem.run.checkpoint import FORMAT
 from softgrasp.fem.run.contact.friction import FlatFriction
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.scene.file import load_scene
@@ -257,6 +259,30 @@ def test_restart_in_friction_repeats_the_bits(obstacle: str, mpi_tmp_path: Path)
     assert np.array_equal(again.contact.force, whole.contact.force)
     assert again.contact.rubbed == whole.contact.rubbed
     assert again.contact.rounds == whole.contact.rounds
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_only_restart_files_with_friction_need_its_form(friction: float, tmp_path: Path) -> None:
+    overrides, manifest = [*SMALL, SIDE, table(friction)], tmp_path / "checkpoint/checkpoint.json"
+    with pytest.raises(Paused):
+        simulate(build("paper_forward", overrides), RunOptions(tmp_path, until=3))
+    entry = read_manifest(manifest, FORMAT)
+    assert ("friction" in entry) is (friction > 0)
+    entry.pop("friction", None)  # as versions wrote it whose sets have another form
+    write_manifest(manifest, entry)
+    options = RunOptions(tmp_path, resume=True)
+    if not friction:
+        whole = run(SIDE, table(0.0))
+        again = simulate(build("paper_forward", overrides), options)
+        assert whole.contact.touching[:3].max() == 0 < whole.contact.touching.max()
+        assert np.array_equal(again.final, whole.final)
+        return
+    with pytest.raises(CheckpointError) as error:
+        simulate(build("paper_forward", overrides), options)
+    assert str(error.value) == (
+        f"{manifest} was written by another version of softgrasp, which continues friction in another form; run again "
+        "without --resume"
+    )
 
 
 BLOCK = [
