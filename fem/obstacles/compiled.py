@@ -8,7 +8,7 @@ from typing import Any
 from softgrasp.fem.strain.compiled import library
 
 SOURCE = Path(__file__).with_name("contact.c")
-HEADERS = tuple(SOURCE.with_name(name) for name in ("dense.h", "flat.h", "pivots.h"))
+HEADERS = tuple(SOURCE.with_name(name) for name in ("dense.h", "flat.h", "pivots.h", "rub.h"))
 RIDGE = 1e-13  # share of the diagonal that makes equal rows share their force [1]
 RETRIES = 3  # rounds without progress before rows change sides one by one
 DEFINED = (f"RIDGE={RIDGE!r}", f"RETRIES={RETRIES}")
@@ -28,7 +28,7 @@ def contact_library() -> Any:
 def friction_library() -> Any:
     """See `compiled`, of `friction.c`."""
     source = SOURCE.with_name("friction.c")
-    code = source.read_text()
+    code = SOURCE.with_name("rub.h").read_text()
     struct = code[code.index("typedef struct {") : code.index("} Rub;")] + "} Rub;\n"
     return compiled(source, struct + RUB_DECLARATIONS)
 
@@ -40,6 +40,7 @@ int softgrasp_complement(int p, int ld, const double *W, const double *q, double
 double softgrasp_look(const Flat *f);
 void softgrasp_values(const Flat *f, double *to);
 void softgrasp_refresh(const Flat *f);
+double softgrasp_rubbed(const Flat *f);
 int softgrasp_step(Flat *f, int n);
 int softgrasp_finish(Flat *f, int n, const double *v);
 void softgrasp_strike(const Flat *f, int n, double *v);
@@ -48,7 +49,7 @@ int softgrasp_stop(Flat *f, int n, double *v);
 RUB_DECLARATIONS = """
 void softgrasp_matrix(Rub *f);
 void softgrasp_units(Rub *f);
-void softgrasp_judge(Rub *f);
+void softgrasp_lead(Rub *f);
 int softgrasp_rub(Rub *f, int begin, int rounds);
 void softgrasp_sweep(Rub *f, int sweeps, double still);
 double softgrasp_wrong(Rub *f);

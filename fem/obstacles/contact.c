@@ -117,6 +117,14 @@ static void apply(const Flat *f) {
   }
 }
 
+/* Work of friction in the step. */
+double softgrasp_rubbed(const Flat *f) {
+  double work = 0;
+  for (int j = 0; j < f->k; j++)
+    if (f->row[4 * j + 3] != 0 && f->x[j] != 0) work += f->x[j] * 2 * value(f, j);
+  return work;
+}
+
 /* Tables of step n: force and number of pressed nodes of each half-space, T'N'x, and energies. */
 static void account(const Flat *f, int n) {
   double *force = f->force + (size_t)n * f->obstacles * f->d, *touching = f->touching + (size_t)n * f->obstacles;

@@ -33,6 +33,7 @@ LITTLE = 0.2  # first coefficient of friction that grows
 GROWTH, LEAST = 1.4, 1.04  # by how much it does, and by how much it must
 REFINED = 6  # pyramids, each with edges three times as near to the last directions
 NEARLY = 1e-9  # of a force, below which its node slips, or is open [1]
+KINDS = {np.dtype(float): "double[]", np.dtype(np.intc): "int[]", np.dtype(np.int8): "char[]"}  # in C
 SOLVED, WANTED = 0, 1  # what `softgrasp_rub` says; else the rounds lead nowhere
 
 
@@ -55,7 +56,8 @@ class Coulomb:
         self.code: Any = None if engine == "NumPy" else friction_library()
         self.tally = np.zeros(3, np.int64)
         self.x, self.kind, self.e = np.zeros((0, 1 + tangents)), np.zeros(0, np.intc), np.zeros((0, 1 + tangents))
-        self.before = np.zeros((0, 1 + tangents))  # forces at which the step before the last ended, if it has
+        self.before = np.zeros((0, 1 + tangents))  # forces at which the step before the last ended
+        self.had = False  # whether it had any
         self.kind0, self.e0, self.other = np.zeros(0, np.intc), np.zeros((0, 1 + tangents)), np.zeros(0, np.intc)
         self.W, self.arrays = np.zeros((0, 0)), dict[str, NDArray[Any]]()
         self.f: Any = None if self.code is None else self.code[0].new("Rub *")
@@ -72,26 +74,27 @@ class Coulomb:
         e[:, 0] = 1.0
         x[:have], e[:have], kind[:have] = self.x[:have], self.e[:have], self.kind[:have]
         self.x, self.e, self.kind = x, e, kind
-        self.kind0, self.e0, self.before = kind.copy(), e.copy(), x[:0]
+        self.kind0, self.e0, self.before, self.had = kind.copy(), e.copy(), np.zeros_like(x), False
         if self.code is None:
             return
         K = k * s
         most = max(6, min(K // 6, 24))
         self.other = np.zeros(most, np.intc)
-        self.LU, self.pivot, self.y = np.zeros((K, K)), np.zeros(K, np.intc), np.zeros(K)
+        self.LU, self.pivot, self.y = np.zeros(K * K), np.zeros(K, np.intc), np.zeros(K)
         self._point(
-            x=self.x, y=self.y, kind=self.kind, e=self.e, LU=self.LU, pivot=self.pivot, kind0=self.kind0, e0=self.e0,
-            other=self.other, Z=np.zeros((most, K)), V=np.zeros((most, K)), C=np.zeros((most, most)),
-            room=np.zeros(4 * K + most), past=np.zeros((PAST, K)),
+            before=self.before, x=self.x, y=self.y, kind=self.kind, e=self.e, LU=self.LU, pivot=self.pivot,
+            kind0=self.kind0, e0=self.e0, other=self.other, Z=np.zeros((most, K)), V=np.zeros((most, K)),
+            C=np.zeros((most, most)), room=np.zeros(6 * K + most), past=np.zeros((PAST, K)),
             seen=np.zeros((ROUNDS[self.m], k), np.int8), tally=self.tally,
         )  # fmt: skip
         self.f.k, self.f.m, self.f.most, self.f.rows, self.f.count = k, self.m, most, 0, 0
 
     def _point(self, **arrays: NDArray[Any]) -> None:
         """Let fields of the struct point at arrays, which are kept."""
-        kinds = {np.dtype(float): "double[]", np.dtype(np.intc): "int[]", np.dtype(np.int8): "char[]"}
         for name, array in arrays.items():
-            kind = kinds.get(array.dtype, "long[]")
+            if self.arrays.get(name) is array:
+                continue
+            kind = KINDS.get(array.dtype, "long[]")
             setattr(self.f, name, self.code[0].from_buffer(kind, array))
             self.arrays[name] = array
 
@@ -130,14 +133,12 @@ class Coulomb:
         """Forces that continue those of the last two steps, with their sets and directions; whether there were two."""
         if self.code is None:
             return False
-        before, self.before = self.before, self.x[: len(self.x) * bool(self.x.any())].copy()
-        if not len(before):
+        had, self.had = self.had, bool(self.x.any())
+        if not (had and self.had):
+            self.before[:] = self.x
             return False
-        self.x *= 2
-        self.x -= before
-        self.x[self.kind == OPEN] = 0.0
         self._describe(W, q, mu, tol)
-        self.code[1].softgrasp_judge(self.f)
+        self.code[1].softgrasp_lead(self.f)
         return True
 
     def _attempt(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
@@ -234,10 +235,11 @@ class Coulomb:
     def _factor(self) -> None:
         """The factor of the matrix of the present sets."""
         self.code[1].softgrasp_matrix(self.f)
-        lu, pivot, _ = dgetrf(self.LU.T, overwrite_a=True)
-        if lu.base is not self.LU and lu is not self.LU:
-            self.LU.T[:] = lu
-        self.pivot[:] = pivot
+        if n := int(self.f.size):  # else all nodes are open
+            matrix = self.LU[: n * n].reshape(n, n).T
+            lu, self.pivot[:n], _ = dgetrf(matrix, overwrite_a=True)
+            if not np.shares_memory(lu, self.LU):
+                matrix[:] = lu
 
     # ---- restart
 
@@ -245,7 +247,7 @@ class Coulomb:
         """Numbers from which a run continues with the same bits."""
         count = 0 if self.f is None else int(self.f.count)
         rows = 0 if self.f is None else int(self.f.rows)
-        head = np.array([len(self.kind), rows, count, *self.tally[:2]], dtype=float)
+        head = np.array([len(self.kind), rows, count, *self.tally[:2], self.had], dtype=float)
         parts = self.x, self.kind, self.e, self.kind0, self.e0, self.other[:count], self.before
         return np.concatenate([head, *(np.asarray(part, dtype=float).ravel() for part in parts)])
 
@@ -256,8 +258,8 @@ class Coulomb:
         self.fit(k)
         self.tally[:2] = numbers[3:5]
         sizes = [k * s, k, k * s, k, k * s, count]
-        x, kind, e, kind0, e0, other, before = np.split(numbers[5:], np.cumsum(sizes))
-        self.before = before.reshape(-1, s)
+        x, kind, e, kind0, e0, other, before = np.split(numbers[6:], np.cumsum(sizes))
+        self.before[:], self.had = before.reshape(k, s), bool(numbers[5])
         self.x[:], self.e[:] = x.reshape(k, s), e.reshape(k, s)
         if self.f is not None and rows:
             self._point(W=W, mu=mu)

@@ -1,100 +1,6 @@
 /* Coulomb's law at k nodes with m tangents each, see coulomb.py: Newton's method on the sets open, stick and slip, whose
    factor stays while few rows of its matrix change. Rows of a node: its normal, then its tangents. */
-#include "dense.h"
-
-enum { OPEN, STICK, SLIP };
-enum { SOLVED = 0, WANTED = 1, CYCLED = 2 };
-enum { LATE = 4, PAST = 15 };        /* steps that are kept, at most */
-static const double SLOW = 0.3; /* by how much a round should reduce the residual */
-
-typedef struct {
-  int k, m, ld;          /* nodes, tangents, columns of W */
-  const double *W, *q, *mu;
-  double tol;            /* of gaps and slips */
-  double *x, *y;         /* forces, and W x + q (k (1 + m)) */
-  int *kind;             /* sets (k) */
-  double *e;             /* of a slipping node: direction of its force, and mu x_n over |x_t - y_t / W_tt| (k (m + 1)) */
-  double *LU;            /* factor, by columns (K, K), K = k (1 + m); 0 rows: there is none */
-  int rows, *pivot;
-  int *kind0;            /* sets and directions that it is of */
-  double *e0;
-  int most, count;       /* rows of the matrix that may be others than those of the factor, and that are */
-  int *other;            /* these rows (most) */
-  double *Z, *V, *C;     /* factor^-1 of their units, what they are more (most, K); small matrix (most, most) */
-  double *room;          /* 4 K + most numbers */
-  double *past;          /* steps of rounds in which no set changed (PAST + 1, K) */
-  char *seen;            /* sets of the rounds (ROUNDS, k) */
-  long *tally;           /* rounds, sweeps */
-} Rub;
-
-static double diagonal(const Rub *f, int r) { return f->W[(size_t)r * f->ld + r]; }
-
-static void row_of(const Rub *f, int i, int a, int kind, const double *e, double *v) {
-  const int s = 1 + f->m, K = f->k * s, r = i * s + a;
-  memset(v, 0, K * sizeof(double));
-  if (kind == OPEN) {
-    v[r] = diagonal(f, r);
-  } else if (a == 0 || kind == STICK) {
-    memcpy(v, f->W + (size_t)r * f->ld, K * sizeof(double));
-    v[r] *= 1 + RIDGE;
-  } else {
-    const double w = diagonal(f, i * s + 1), c = f->m > 1 ? e[f->m] : 0;
-    for (int b = 0; b < f->m; b++) {
-      const double P = (a - 1 == b) - e[a - 1] * e[b];
-      if (c != 0) {
-        const double *W = f->W + (size_t)(i * s + 1 + b) * f->ld;
-        for (int j = 0; j < K; j++) v[j] += c * P * W[j];
-      }
-      v[i * s + 1 + b] += w * ((a - 1 == b) - c * P);
-    }
-    v[i * s] -= w * f->mu[i] * e[a - 1];
-  }
-}
-
-/* The matrix of the present sets, by columns, into LU. */
-void softgrasp_matrix(Rub *f) {
-  const int s = 1 + f->m, K = f->k * s;
-  for (int i = 0; i < f->k; i++)
-    for (int a = 0; a < s; a++) {
-      row_of(f, i, a, f->kind[i], f->e + i * s, f->room);
-      for (int j = 0; j < K; j++) f->LU[(size_t)j * K + i * s + a] = f->room[j];
-    }
-  memcpy(f->kind0, f->kind, f->k * sizeof(int));
-  memcpy(f->e0, f->e, (size_t)f->k * s * sizeof(double));
-  f->rows = K;
-  f->count = 0;
-}
-
-static void back(const Rub *f, double *restrict b) {
-  const int K = f->rows;
-  for (int j = 0; j < K; j++) {
-    const double t = b[f->pivot[j]];
-    b[f->pivot[j]] = b[j];
-    b[j] = t;
-  }
-  int j = 0;
-  for (; j + 4 <= K; j += 4) { /* four columns in a pass */
-    const double *l = f->LU + (size_t)j * K, *l1 = l + K, *l2 = l1 + K, *l3 = l2 + K, t0 = b[j];
-    const double t1 = b[j + 1] -= l[j + 1] * t0;
-    const double t2 = b[j + 2] -= l[j + 2] * t0 + l1[j + 2] * t1;
-    const double t3 = b[j + 3] -= l[j + 3] * t0 + l1[j + 3] * t1 + l2[j + 3] * t2;
-    for (int i = j + 4; i < K; i++) b[i] -= (l[i] * t0 + l1[i] * t1) + (l2[i] * t2 + l3[i] * t3);
-  }
-  for (; j < K; j++)
-    for (int i = j + 1; i < K; i++) b[i] -= f->LU[(size_t)j * K + i] * b[j];
-  for (j = K; j > K / 4 * 4;) {
-    const double *u = f->LU + (size_t)--j * K, t = b[j] /= u[j];
-    for (int i = 0; i < j; i++) b[i] -= u[i] * t;
-  }
-  while (j > 0) {
-    j -= 4;
-    const double *u = f->LU + (size_t)j * K, *u1 = u + K, *u2 = u1 + K, *u3 = u2 + K, t3 = b[j + 3] /= u3[j + 3];
-    const double t2 = b[j + 2] = (b[j + 2] - u3[j + 2] * t3) / u2[j + 2];
-    const double t1 = b[j + 1] = (b[j + 1] - u3[j + 1] * t3 - u2[j + 1] * t2) / u1[j + 1];
-    const double t0 = b[j] = (b[j] - u3[j] * t3 - u2[j] * t2 - u1[j] * t1) / u[j];
-    for (int i = 0; i < j; i++) b[i] -= (u[i] * t0 + u1[i] * t1) + (u2[i] * t2 + u3[i] * t3);
-  }
-}
+#include "rub.h"
 
 /* Gaussian elimination with pivots of a small matrix by rows; b becomes the solution. */
 static void eliminate(int n, double *A, int ld, double *b) {
@@ -256,8 +162,14 @@ static int classify(Rub *f) {
   return changed;
 }
 
-/* Sets and directions of forces that were not solved for. */
-void softgrasp_judge(Rub *f) {
+/* Forces that continue those of the last two steps, with their sets and directions; those of the last step into `before`. */
+void softgrasp_lead(Rub *f) {
+  const int s = 1 + f->m, K = f->k * s;
+  for (int r = 0; r < K; r++) {
+    const double x = f->x[r];
+    f->x[r] = f->kind[r / s] == OPEN ? 0 : 2 * x - f->before[r];
+    f->before[r] = x;
+  }
   evaluate(f);
   classify(f);
 }

@@ -27,7 +27,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.shown import counted
 
 FORMAT = 7
-FRICTION = 2  # form of the sets of friction in them
+FRICTION = 3  # form of the sets of friction in them
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # keys of [output] that change no number of a run
 FREE = ("name", "description", "reduction", "study")
 OLD = ("*step*-rank*", "*frame*.npz")  # patterns of the files that a new manifest makes useless

@@ -57,25 +57,30 @@ class RubbingRows(Rows):
 
 
 def rubbing_impulse(
-    contact: Contact, jolt: Coulomb, rows: RubbingRows, mu: Array, A: Array, v: Array, still: float
+    contact: Contact, jolt: Coulomb, x: Array, rubbed: float, mu: Array, A: Array, v: Array, still: float
 ) -> Array | None:
     """Impulse with friction (k d,) that stops rows; None where friction would not dissipate energy in the step.
 
     Args:
         jolt: problem of the impulses, with room for the rows, and sets to begin from.
+        x: forces of the step on the rows [N], (k, d).
+        rubbed: work of friction in the step [J].
         mu: coefficients of friction, (k,).
         A: N M^-1 N' of the rows, a normal and then its tangents, (k d, k d).
         v: velocities along them, (k, d).
         still: velocity that is rounding [m/s].
     """
-    (k, s), before = v.shape, np.ascontiguousarray(v.ravel())
-    pushed = contact.dt * np.column_stack([rows.x, rows.x_t])
-    jolt.x[:] = pushed
-    y = (jolt.solve(k, A, before - A @ pushed.ravel(), mu, still) - pushed).ravel()
-    taken = (-y * (before + A @ y / 2)).reshape(k, s)
-    if taken[:, 1:].sum() - np.einsum("ka,ka->", rows.x_t, rows.slip) < 0:
+    before = v.ravel()
+    pushed = np.multiply(x, contact.dt, out=jolt.x)
+    q = before - A @ pushed.ravel()
+    pushed = pushed.copy()
+    y = (jolt.solve(len(x), A, q, mu, still) - pushed).ravel()
+    taken = -y * (before + A @ y / 2)
+    along = float(taken[:: v.shape[1]].sum())
+    across = float(taken.sum()) - along
+    if across - rubbed < 0:
         return None
-    contact.table.energy[2:] += taken[:, 0].sum(), taken[:, 1:].sum()
+    contact.table.energy[2:] += along, across
     return y
 
 
@@ -153,7 +158,8 @@ class FrictionContact(Contact):
         A = np.ascontiguousarray(self.strike.reactions().matrix(node, axes))
         self.jolt.fit(len(rows.node))
         self.jolt.kind[:], self.jolt.e[:] = rows.kind, rows.e
-        y = rubbing_impulse(self, self.jolt, rows, self.mu[rows.obstacle], A, speed, still)
+        x, rubbed = np.column_stack([rows.x, rows.x_t]), float(np.einsum("ka,ka->", rows.x_t, rows.slip))
+        y = rubbing_impulse(self, self.jolt, x, rubbed, self.mu[rows.obstacle], A, speed, still)
         if y is None:
             super()._halt(state, n, rows, normal, v, still)
             return
@@ -238,15 +244,15 @@ class FlatFriction(FlatContact):
     def _enter(self, pairs: Ints) -> None:
         """See :meth:`FlatContact._enter`. Collective."""
         super()._enter(pairs)
-        self.friction = self.mu[self._pairs()[:, 0]]
+        self.friction, self.load = self.mu[self._pairs()[:, 0]], self.free[: self.f.k]
 
     def _fit(self, size: int) -> None:
         """See :meth:`FlatContact._fit`: without the problem of normal forces alone."""
 
     def _balance(self, tol: float) -> Array:
         """See :meth:`FlatContact._balance`."""
-        k, coulomb = self.f.k, self.side.coulomb
-        x = coulomb.solve(k // self.d, self.W, self.free[:k], self.friction, tol, self.f.round == 0)
+        coulomb = self.side.coulomb
+        x = coulomb.solve(self.f.k // self.d, self.W, self.load, self.friction, tol, self.f.round == 0)
         self.point(kind=coulomb.kind)
         self.small.tally[0] = sum(side.coulomb.rounds for side in self.sides)
         return x.ravel()
@@ -264,15 +270,16 @@ class FlatFriction(FlatContact):
 
     def _halt_flat(self, state: TissueState, v: Any) -> None:
         """See :meth:`FlatContact._halt_flat`. Collective."""
-        rows, s, k = self._pressed_rows(), self.d, len(self.row)
-        on = np.flatnonzero(np.repeat(self.x[:k:s] > 0, s))
+        s, k, side = self.d, len(self.row), self.side
+        nodes = np.flatnonzero(self.x[:k:s] > 0)
+        on = (s * nodes[:, None] + np.arange(s)).ravel()
         if on[-1] >= self.f.struck:
             self.stops.enter()
-        side, before = self.side, -self.rates[on].reshape(-1, s)
         if not np.array_equal(on, side.stopped):
             side.stop(on, self.stops.A)
-            side.jolt.kind[:], side.jolt.e[:] = rows.kind, rows.e
-        y = rubbing_impulse(self, side.jolt, rows, self.mu[rows.obstacle], side.A, before, self.f.still)
+            side.jolt.kind[:], side.jolt.e[:] = side.coulomb.kind[nodes], side.coulomb.e[nodes]
+        x, before, rubbed = self.x[on].reshape(-1, s), -self.rates[on].reshape(-1, s), self.c.softgrasp_rubbed(self.f)
+        y = rubbing_impulse(self, side.jolt, x, rubbed, self.friction[nodes], side.A, before, self.f.still)
         self.struck[:k] = 0.0
         if y is None:
             first = on[::s]

@@ -93,6 +93,20 @@ def test_in_two_dimensions_pivots_find_forces_for_any_friction(
     assert refused <= 1  # by rounding: 0 of 480 seen with the kernels of two kinds of processors
 
 
+def test_in_two_dimensions_a_round_with_the_right_sets_is_exact() -> None:
+    """Forces of larger loads, whose sets stay: from the factor that has lost the rows of slipping and open nodes."""
+    rng, k = np.random.default_rng(7), 40
+    A, q, mu = rng.standard_normal((2 * k + 2, 2 * k)), rng.standard_normal(2 * k), np.full(k, 0.4)
+    W, coulomb = A.T @ A / k + 0.5 * np.eye(2 * k), Coulomb(1, "C")
+    x = coulomb.solve(k, W, q, mu, 1e-12).copy()
+    assert np.bincount(coulomb.kind, minlength=3).min() >= 5  # open, stick and slip
+    coulomb.forget()
+    before = coulomb.rounds
+    assert coulomb._attempt(W, 3 * q, mu, 1e-12)
+    assert coulomb.rounds == before + 1
+    assert np.abs(coulomb.x - 3 * x).max() < 1e-12 * np.abs(x).max()  # rounding, condition of W below 1e2
+
+
 def test_a_basis_that_rounding_made_singular_ends_the_pivots(monkeypatch: pytest.MonkeyPatch) -> None:
     """As it was seen with mu of 1000 and more; NumPy's own error would end the run without a sentence."""
     A = np.random.default_rng(0).standard_normal((24, 24))
