@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.reduction.bases.basis import Coordinates
-from softgrasp.reduction.bases.engines import EngineName, Factor, factor, small_svd
+from softgrasp.reduction.bases.engines import EngineName, Factor, factor, numerical_rank, small_svd
 from softgrasp.reduction.bases.inner import InnerName, Rows, Weight, weights
 from softgrasp.reduction.bases.states import BasisError, Columns, States
 from softgrasp.reduction.bases.truncation import Part
@@ -107,7 +107,7 @@ def pod_part(
         return place(U)
 
     square = f.square if L is None else float(np.sum(s**2))
-    return Part(title, s, square, int(np.count_nonzero(s > f.noise * s[0])), columns, f.scale)
+    return Part(title, s, square, numerical_rank(s, f.noise), columns, f.scale)
 
 
 def joint_parts(request: PartsRequest) -> tuple[Part, ...]:

@@ -19,7 +19,7 @@ import scipy.linalg
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.fem.solve.statics import solve_columns
-from softgrasp.reduction.bases.engines import Factor, magnitude, small_svd
+from softgrasp.reduction.bases.engines import Factor, magnitude, numerical_rank, small_svd
 from softgrasp.reduction.bases.inner import Rows, Weight, weights
 from softgrasp.reduction.bases.pod import PartsRequest, cholesky_of, weighted_factor
 from softgrasp.reduction.bases.states import Columns
@@ -163,9 +163,8 @@ def svd_like_parts(request: PartsRequest) -> tuple[Part, ...]:
         return c.place(E_q[:, :k], E_y[:, :k]), c.place(E_q[:, k:], E_y[:, k:])
 
     total_square = float(np.sum(c.C_q**2) + np.sum(c.C_y**2))
-    return (Part("phase space", w, total_square, len(w), columns, c.scale, c.rate),)
+    return (Part("phase space", w, total_square, numerical_rank(w), columns, c.scale, c.rate),)
 
 
 def _part(title: str, c: Canonical, s: Array, columns: Callable[[int], tuple[Columns, ...]]) -> Part:
-    rank = int(np.count_nonzero(s > c.factor.noise * s[0]))
-    return Part(title, s, float(np.sum(s**2)), rank, columns, c.scale, c.rate)
+    return Part(title, s, float(np.sum(s**2)), numerical_rank(s, c.factor.noise), columns, c.scale, c.rate)

@@ -10,12 +10,11 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.reduction.bases.aside import aside
-from softgrasp.reduction.bases.engines import EPS
+from softgrasp.reduction.bases.engines import EPS, SNAPSHOT_ROUNDING
 from softgrasp.reduction.bases.states import BasisError
 
 # eigenvalues of X'JX carry an absolute error eps * |X|^2: a stage uses those that keep about ten digits
 STAGE = 1e-6
-SMALLEST = 1e-13  # what is left below this share of |X| is rounding of the snapshots
 # V'JV = J can be true to about eps |s|^2 only: vectors that are almost J-orthogonal make no pair with each other
 LONGEST = 200.0  # |s|^2 + |t|^2
 DROP = 0.1  # directions without partner are used together down to this share of the largest
@@ -98,7 +97,7 @@ class _PairSelection:
         """Set rest, U, s and size to the few columns that span the same space; X'JX is rotated only."""
         with aside():
             U, s, _ = np.linalg.svd(rest, full_matrices=False)
-        keep = s > max(EPS * s[0], 0.01 * SMALLEST * self.largest) if len(s) else s > 0
+        keep = s > max(EPS * s[0], 0.01 * SNAPSHOT_ROUNDING * self.largest) if len(s) else s > 0
         self.U, self.s = U[:, keep], s[keep]
         self.rest = self.U * self.s
         self.size = float(self.s[0]) if keep.any() else 0.0
@@ -112,7 +111,7 @@ class _PairSelection:
                 break
             if len(self.weights):
                 self._compress(self.rest)
-            if not self.size > SMALLEST * self.largest:
+            if not self.size > SNAPSHOT_ROUNDING * self.largest:
                 break
             if not self._stage():
                 self._alone()
