@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from softgrasp.fem.accuracy.estimate import extrapolated
     from softgrasp.fem.accuracy.price import run_seconds
     from softgrasp.fem.checksums import digest, read_manifest, write_manifest
-    from softgrasp.fem.columns import AXES, Array, Columns, OutputColumn, farthest, hand_columns
+    from softgrasp.fem.columns import AXES, Array, Columns, OutputColumn, farthest, hand_columns, placed
     from softgrasp.fem.effects import EFFECTS
     from softgrasp.fem.effects.damping import layered
     from softgrasp.fem.effects.finite_strain import linear_error

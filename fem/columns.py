@@ -56,6 +56,11 @@ def labels(columns: Sequence[OutputColumn]) -> tuple[str, ...]:
     return tuple(column.label for column in columns)
 
 
+def label_unit(label: str) -> str:
+    """Unit of an output by its label: "rad" of "tip_rz", else "m"."""
+    return "rad" if label.rpartition("_")[2] in TURNS else "m"
+
+
 def hand_of(n_s: int, outputs: Sequence[str]) -> Columns:
     """The hand's degrees of freedom where only the labels of the outputs determine whether it moves in space."""
     return hand_columns(n_s, 3 if n_s == 6 or any(name.endswith("_z") for name in outputs) else 2)
@@ -65,6 +70,15 @@ def hand_columns(n_s: int, dimension: int, name: str = "hand") -> Columns:
     """The hand's degrees of freedom: x, y (z), then the rotations rz in the plane, rx, ry, rz in space."""
     turns = TURNS[2:] if dimension == 2 else TURNS
     return tuple(OutputColumn(name, axis) for axis in (*AXES[:dimension], *turns)[:n_s])
+
+
+def placed(q: Array, columns: Sequence[OutputColumn], digits: int) -> str:
+    """Values by their units, in so many digits: "(0.02, -0.02) m", "(0.02, -0.02) m, 0.1 rad"."""
+    parts = []
+    for unit in dict.fromkeys(column.unit for column in columns):
+        values = [f"{x:.{digits}g}" for x, column in zip(q, columns, strict=True) if column.unit == unit]
+        parts.append(f"{values[0] if len(values) == 1 else f'({", ".join(values)})'} {unit}")
+    return ", ".join(parts)
 
 
 def farthest(outputs: Array, target: Array, columns: Sequence[OutputColumn] = ()) -> Array:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from softgrasp.lqr.design.orders import BasisGains, Notify
     from softgrasp.lqr.design.scene import control_of, with_control
     from softgrasp.lqr.loop.controller import load_gain
-    from softgrasp.lqr.loop.full import LoopTrajectory
+    from softgrasp.lqr.loop.full import LoopOptions, LoopTrajectory
     from softgrasp.lqr.loop.margins import LoopMargins
     from softgrasp.lqr.plant.checks import ControlError
     from softgrasp.lqr.plant.gain import PlantState

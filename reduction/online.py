@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.columns import TURNS
+from softgrasp.fem.columns import label_unit
 from softgrasp.fem.labelled import Labelled, Quantity, of_energy, of_hand
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.reduced import march_together
@@ -65,7 +65,7 @@ class ReducedTrajectory(Shown, Labelled):
     @property
     def quantities(self) -> dict[str, Quantity]:
         """Outputs, hand and energy over time with their labels and units."""
-        units = tuple("rad" if name.rsplit("_", 1)[-1] in TURNS else "m" for name in self.output_names)
+        units = tuple(label_unit(name) for name in self.output_names)
         return {
             "outputs": Quantity(self.outputs, self.output_names, units, "output"),
             "q_s": of_hand(self.q_s, self.output_names),

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from softgrasp.reduction.reduce import errors as errors
     from softgrasp.reduction.reduce import reduce as reduce
     from softgrasp.reduction.reduce import replay as replay
+    from softgrasp.study.reduce.linear.table import compare_bases as compare_bases
     from softgrasp.study.runs.sweep import sweep as sweep
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy: ranks share the cores
@@ -76,6 +77,7 @@ _FACE = {
     "make_controller": "lqr.design",
     "Controller": "lqr.loop.controller",
     "sweep": "study.runs.sweep",
+    "compare_bases": "study.reduce.linear.table",
 }
 """What a user imports -> the module that has it."""
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import html
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -28,6 +29,8 @@ from softgrasp.study.pictures import MOST_FRAMES, histories, move_bytes
 from softgrasp.study.pictures.style import CYCLE, FULL, WIDTH, length_unit, log_axis, paper_style
 from softgrasp.study.pictures.traces import traces
 from softgrasp.study.pictures.turning import Scene3D
+from softgrasp.study.reduce.linear.plots import QUANTITIES, errors_figure
+from softgrasp.study.reduce.linear.result import MethodSweep
 
 FREQUENCIES = 800  # of a Bode diagram, even in log w
 
@@ -108,6 +111,11 @@ def model_errors(rom: ReducedModel, model: Model, run: Trajectory) -> Any:
     return _free(figure)
 
 
+def table_errors(sweeps: Sequence[MethodSweep]) -> Any:
+    """Error of the deformation against N, a curve a basis. Not collective."""
+    return _free(errors_figure([s for s in sweeps if s.points], QUANTITIES[:1]))
+
+
 def explorer(rom: ReducedModel, model: Model, run: Trajectory, span: float) -> Any:
     """Sliders of lambda and mu of each layer above the outputs of a reduced model. Not collective: one rank."""
     if not 1 < span < np.inf:
@@ -180,7 +188,7 @@ class View:
         return f'<iframe {look} srcdoc="{html.escape(self.html)}"></iframe>'
 
 
-def view3d(run: Trajectory, model: Model) -> View:
+def view3d(run: Trajectory | LoopTrajectory, model: Model) -> View:
     """The move to turn, zoom and play, without obstacles. Collective; rank 0 draws, the others get an empty page.
 
     Raises SoftgraspError: the run kept no snapshots.
@@ -201,8 +209,8 @@ def view3d(run: Trajectory, model: Model) -> View:
     )  # fmt: skip
 
 
-def animation(run: Trajectory, model: Model) -> Film:
-    """The move as an animated picture. Collective; rank 0 draws, the others get an empty film.
+def animation(run: Trajectory | LoopTrajectory, model: Model) -> Film:
+    """The move as an animated picture, of a free run with its target. Collective; rank 0 draws, the others get nothing.
 
     Raises SoftgraspError: the run kept no snapshots.
     """
@@ -210,14 +218,16 @@ def animation(run: Trajectory, model: Model) -> Film:
     if picture is None or states is None:
         return Film(b"")
     table: Array = np.column_stack([run.times, run.q_s])
-    return Film(move_bytes(picture, states, times, table, model.scene.motion.target))
+    target = model.scene.motion.target if isinstance(run, Trajectory) else None  # a loop may go elsewhere
+    return Film(move_bytes(picture, states, times, table, target))
 
 
-def _shown(run: Trajectory, model: Model) -> tuple[PictureMesh | None, Array | None, Array, Array]:
+def _shown(run: Trajectory | LoopTrajectory, model: Model) -> tuple[PictureMesh | None, Array | None, Array, Array]:
     """The body, displacements (k, n, d) [m], hands (k, n_s) and times (k,) [s] of at most 60 instants. Collective."""
     kept = run.snapshots
     if kept is None:
-        raise SoftgraspError("the run kept no snapshots in memory; set output.snapshots = 'memory'")
+        cure = "set output.snapshots" if isinstance(run, Trajectory) else "give its LoopOptions snapshots"
+        raise SoftgraspError(f"the run kept no snapshots in memory; {cure} = 'memory'")
     pick = np.unique(np.linspace(0, len(kept.steps) - 1, MOST_FRAMES).round().astype(int))
     n = kept.layout.n_local
     states = vertex_displacement(model, kept.Z[:n, pick], kept.q_s[:, pick])

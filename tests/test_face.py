@@ -37,6 +37,13 @@ def test_import_loads_neither_mpi_nor_dolfinx() -> None:
     assert done.stdout.strip() == "set()", done.stderr
 
 
+def test_a_script_beside_the_checkout_imports_the_package(tmp_path: Path) -> None:
+    (tmp_path / "softgrasp" / "fem").mkdir(parents=True)  # as a clone, whose own softgrasp lies deeper
+    (tmp_path / "mine.py").write_text("import softgrasp as sg; print(sg.__version__)")
+    done = subprocess.run([sys.executable, tmp_path / "mine.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.strip() == sg.__version__, done.stderr
+
+
 def test_an_unknown_name_says_what_there_is() -> None:
     with pytest.raises(AttributeError, match=r"'simulat'; it has ClosedLoop, .*simulate"):
         sg.simulat  # noqa: B018

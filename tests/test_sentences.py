@@ -191,6 +191,11 @@ def test_damaged_controllers_and_gains_are_named(tmp_path: Path) -> None:
     ):
         with pytest.raises(SoftgraspError, match=re.escape(sentence)):
             sg.Controller.load(path)
+    full = write_npz(tmp_path / "gain.npz", {"format": 1, "layout_hash": ""}, {"tissue": np.eye(2)})
+    with pytest.raises(
+        SoftgraspError, match=r"gain\.npz is a gain of full order, for lqr\.load_gain; controller\.npz has"
+    ):
+        sg.Controller.load(full)
     with pytest.raises(SoftgraspError, match=r"bare\.npz has no full-order gain \(.*\); save it again"):
         load_gain(bare, layout)
 

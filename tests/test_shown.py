@@ -15,6 +15,7 @@ from PIL import Image
 import softgrasp as sg
 from softgrasp.fem.errors import SceneError, SoftgraspError
 from softgrasp.fem.shown import Shown, percent
+from softgrasp.lqr.loop.full import LoopOptions
 from softgrasp.lqr.loop.margins import loop_margins
 
 pytestmark = pytest.mark.serial
@@ -30,7 +31,9 @@ def objects() -> dict[str, Any]:
     rom = sg.reduce(model, run, "psd_fixed", N=14)
     design = sg.design(model)
     controller = sg.make_controller(design, order=8)
-    loop = sg.ClosedLoop(design.problem, dt=0.5).run(design.gain, target=[5.0, 3.0], steps=60)
+    kept = LoopOptions(snapshots="memory", every=3)
+    loop = sg.ClosedLoop(design.problem, dt=0.5).run(design.gain, target=[5.0, 3.0], steps=60, options=kept)
+    table = sg.compare_bases(model, run, ["psd_fixed", "craig_bampton"], N=[14, 3, 20])
     strained = sg.build("paper_forward", **SMALL, time={"steps": 100}, effects={"finite_strain": {}})
     strained_run = sg.simulate(strained)
     strain_model = sg.reduce(strained, strained_run, N=14)
@@ -38,7 +41,7 @@ def objects() -> dict[str, Any]:
         "scene": model.scene, "model": model, "run": run, "rom": rom, "system": rom.at(),
         "replay": sg.replay(rom, model, run), "design": design, "controller": controller,
         "margins": loop_margins(controller), "problem": design.problem, "solution": design.solution, "loop": loop,
-        "strained_run": strained_run, "strain_model": strain_model,
+        "table": table, "strained_run": strained_run, "strain_model": strain_model,
         "strain_replay": sg.replay(strain_model, strained, strained_run),
     }  # fmt: skip
 
@@ -97,14 +100,14 @@ def test_units_and_labels_of_a_run(objects: dict[str, Any]) -> None:
 
 
 def test_figures_show_what_the_objects_hold(objects: dict[str, Any], tmp_path: Path) -> None:
-    run, rom = objects["run"], objects["rom"]
+    run, rom, loop = objects["run"], objects["rom"], objects["loop"]
     outputs, relative = run.plot().axes
     np.testing.assert_array_equal(outputs.lines[0].get_ydata(), run.outputs[:, 0])
     np.testing.assert_array_equal(relative.lines[1].get_ydata(), (run.outputs - run.outputs_rigid)[:, 1])
     np.testing.assert_array_equal(
         objects["replay"].plot().axes[0].lines[1].get_ydata(), objects["replay"].outputs[:, 1]
     )
-    np.testing.assert_array_equal(objects["loop"].plot().axes[0].lines[0].get_ydata(), objects["loop"].outputs[:, 0])
+    np.testing.assert_array_equal(loop.plot().axes[0].lines[0].get_ydata(), loop.outputs[:, 0])
     assert len(objects["margins"].plot().axes) == 2
     gain = objects["system"].bode().axes[0].lines[0]
     omega = gain.get_xdata()[100]
@@ -120,8 +123,12 @@ def test_figures_show_what_the_objects_hold(objects: dict[str, Any], tmp_path: P
     film = run.animate(objects["model"])
     with Image.open(film.save(tmp_path / "move.gif")) as picture:
         assert picture.n_frames > 10
-    with pytest.raises(SoftgraspError, match="kept no snapshots"):
-        replace(run, snapshots=None).animate(objects["model"])
+    for move, cure in ((run, "set output.snapshots = 'memory'"), (loop, "give its LoopOptions snapshots = 'memory'")):
+        with pytest.raises(SoftgraspError, match=f"kept no snapshots in memory; {cure}"):
+            replace(move, snapshots=None).animate(objects["model"])
+    with Image.open(loop.animate(objects["model"]).save(tmp_path / "loop.gif")) as picture:
+        assert picture.n_frames > 10
+    assert '<canvas id="c"' in loop.view3d(objects["model"]).html
     view = run.view3d(objects["model"])
     assert view.save(tmp_path / "move.html").read_text() == view.html
     assert '<canvas id="c"' in view.html
@@ -130,6 +137,40 @@ def test_figures_show_what_the_objects_hold(objects: dict[str, Any], tmp_path: P
     for empty in (replace(view, html=""), replace(film, gif=b"")):  # of a rank above 0
         assert empty.save(tmp_path / "move.html").read_text() == view.html
     assert html.unescape(view._repr_html_().split('srcdoc="')[1].split('">')[0]) == view.html
+
+
+def test_a_table_of_bases_has_the_errors_of_its_models(objects: dict[str, Any]) -> None:
+    pytest.importorskip("xarray")
+    model, run, table = objects["model"], objects["run"], objects["table"]
+    own = sg.errors(objects["rom"], objects["replay"], model, run)  # made without the table
+    data, rows = table.to_xarray(), table.to_pandas()
+    at = data.sel(basis="psd_fixed", N=14)
+    # rounding of snapshots factored for 20 columns; the energy cancels more
+    assert at.error_deformation.item() == pytest.approx(own.error_deformation, rel=1e-6)
+    assert at.error.item() == pytest.approx(own.error, rel=1e-6)
+    assert (data.time_online.attrs["units"], data.error.attrs["units"]) == ("s", "1")
+    assert np.isnan(data.error.sel(N=3)).all()
+    assert not data.stable.sel(N=3).any()  # fewer columns than the hand has
+    assert dict(rows.groupby("basis").size()) == {"psd_fixed": 2, "craig_bampton": 2}
+    assert set(rows["spectral_abscissa [1/s]"]) == {p.spectral_abscissa for s in table.sweeps for p in s.points}
+    drawn = {tuple(line.get_ydata()) for line in table.plot().axes[0].lines}
+    assert tuple(p.error_deformation for p in table.sweeps[1].points) in drawn
+    least = rows.loc[rows.error_deformation.idxmin()]
+    assert f"{percent(least.error_deformation)} of the deformation, {least.basis} at N = {least.N}" in repr(table)
+
+
+def test_a_table_of_bases_refuses_what_it_cannot_compare(objects: dict[str, Any]) -> None:
+    model, run = objects["model"], objects["run"]
+    for wrong in (14, [], [2.5], [0]):
+        with pytest.raises(SceneError, match=r"N = .* must be a list of positive whole numbers, as in \[14, 30\]"):
+            sg.compare_bases(model, run, N=wrong)  # type: ignore[arg-type]
+    with pytest.raises(SceneError, match=r"methods = 'psd' must be a list, as in \['psd'\]"):
+        sg.compare_bases(model, run, "psd")
+    with pytest.raises(SoftgraspError, match="basis 'pssd' is unknown"):
+        sg.compare_bases(model, run, ["pssd"])
+    strained = sg.build("paper_forward", **SMALL, effects={"finite_strain": {}})
+    with pytest.raises(SceneError, match=r"has effects\.finite_strain, whose models have one basis"):
+        sg.compare_bases(strained, objects["strained_run"])
 
 
 def test_sliders_show_the_reduced_model_at_their_material(

@@ -81,7 +81,7 @@ class Term:
 
 def with_terms(scene: Scene, terms: Sequence[Term]) -> Scene:
     """The scene with own terms. Raises SceneError: a name or value is none, or an effect cannot go with one."""
-    if isinstance(terms, Term) or not isinstance(terms, Sequence):
+    if isinstance(terms, Term | str) or not isinstance(terms, Sequence):
         raise SceneError(f"terms is {shortened(repr(terms))}; give a list of softgrasp.Term(name, form, value)")
     names = [*TAKEN, *scene.tissue.parameters]
     for term in terms:

@@ -167,9 +167,11 @@ class Controller(Shown):
         number, or None for all, is lost. Where the hand is not measured, or its samples are absurdly large, a
         controller without observer gives the load of the tick before again; a plan goes on.
 
-        Raises ControlError: there is no observer for y, y has another number of entries, or the hand is not measured at
-        the first tick.
+        Raises ControlError: there is no observer for y, q_s, v_s or y has another number of entries, or the hand is not
+        measured at the first tick.
         """
+        if len(q_s) != len(self.u_bar) or len(v_s) != len(self.u_bar):
+            raise ControlError(f"q_s and v_s have {len(q_s)} and {len(v_s)} entries; this hand has {self.n_s} each")
         if self.observer is not None:
             return self._observed(q_s, v_s, y)
         if y is not None:
@@ -223,10 +225,13 @@ class Controller(Shown):
     def towards(self, q_bar: Array) -> Controller:
         """The same gain with another target of the hand.
 
-        Raises ControlError: the plant has no state of rest there, or the controller follows a plan.
+        Raises ControlError: the target has another number of entries, the plant has no state of rest there, or the
+        controller follows a plan.
         """
         if self.planner is not None:
             raise ControlError("this controller follows a plan to its own target; make another plan for another target")
+        if np.shape(q_bar) != (self.n_s,) or not np.isfinite(q_bar).all():
+            raise ControlError(f"the target must be {self.n_s} finite numbers, one for each motion of the hand")
         x_bar, u_bar = self.plant.rest_at(q_bar)
         return replace(self, x_bar=x_bar, u_bar=u_bar)
 
@@ -261,6 +266,8 @@ class Controller(Shown):
         Raises ControlError: the file is missing, damaged, or made for something else.
         """
         meta, arrays = read_npz(Path(path), {"scene_hash": scene_hash, "layout_hash": layout_hash})
+        if "tissue" in arrays:
+            raise ControlError(f"{path} is a gain of full order, for lqr.load_gain; controller.npz has the controller")
         try:
             plant = ReducedSystem(**{key: arrays[f"plant_{key}"] for key in PLANT}, names=tuple(meta["names"]))
             about = {key: meta[key] for key in ("period", "scene_hash", "layout_hash", "about")}

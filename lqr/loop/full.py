@@ -121,6 +121,20 @@ class LoopTrajectory(Shown, FullOrderRun):
         """Outputs and inputs over time, as ``matplotlib`` figure."""
         return drawn("loop", self)
 
+    def animate(self, model: Model) -> Any:
+        """The move on the mesh of its model, as an animated picture with ``save``. Collective.
+
+        Rank 0 has the picture. Raises SoftgraspError: the run kept no snapshots.
+        """
+        return drawn("animation", self, model)
+
+    def view3d(self, model: Model) -> Any:
+        """The move on the mesh of its model to turn, zoom and play in a notebook, with ``save`` as a page. Collective.
+
+        Rank 0 has the page. Obstacles are not drawn. Raises SoftgraspError: the run kept no snapshots.
+        """
+        return drawn("view3d", self, model)
+
 
 class ClosedLoop:
     """E x' = A x + B u + F g under u = u_bar + K (x - x_bar), in hand-relative coordinates.

@@ -179,7 +179,8 @@ def accuracy(study: GainStudy) -> list[str]:
             f"{percent(change['tissue'])} in those of the tissue."
         )
     bound = small_excess(study)
-    small = f"The gain of the small controller costs at most {percent(bound)} more than the optimal one."
+    share = f"at most {percent(bound)}" if bound >= 1e-6 else "less than 0.0001 %"
+    small = f"The gain of the small controller costs {share} more than the optimal one."
     return [solved, *([small] if np.isfinite(bound) else [])]
 
 

@@ -32,7 +32,7 @@ def run_explain(
     explanation = explain(scene, session.comm)
     page = Page(
         f"{scene.name}: what it simulates", summary(explanation), sections(explanation), options=" --out out",
-        warnings=remarks(explanation),
+        errors=error_lines(explanation.mesh, explanation.effects["frame"].on), warnings=remarks(explanation),
     )  # fmt: skip
     result = {"command": "explain", **origin(scene, session.comm.size), **explanation.to_dict()}
     session.write(scene, result, lambda: page, clock=False)
@@ -71,15 +71,14 @@ def sections(result: Explanation) -> list[Section]:
     if not result.built:
         text += " Sizes with about are computed from that copy, to 1 % of the unknowns and 10 % of the non-zeros."
     copied = [text] if result.coarser else []
+    about_mesh = [*copied, *mesh_lines(result.mesh, result.dimension)]
     no_modes = "" if periods else "Not computed: the factor would not fit."
     parts = [
         Section(EQUATION, code="\n".join(result.equation.plain().lines()), equation=result.equation),
         Section("Sizes", rows=sizes),
         *forecast_section(result.forecasts),
         Section("At rest under its weight, the hand held still", rows=sag_rows(result)),
-        Section(
-            "Mesh", text="\n\n".join([*copied, *mesh_lines(result.mesh, result.dimension, result.effects["frame"].on)])
-        ),
+        *([Section("Mesh", text="\n\n".join(about_mesh))] if about_mesh else []),
         Section("Effects", rows=effects),
         *([Section("What is on", OPERATORS, rows=costs)] if costs else []),
         Section("First modes of the clamped tissue", no_modes, header=modes if periods else (), rows=periods),
@@ -132,7 +131,7 @@ def sag_rows(result: Explanation) -> list[tuple[str, str]]:
     ]  # fmt: skip
 
 
-def mesh_lines(report: MeshSummary, dimension: int, in_frame: bool = False) -> list[str]:
+def mesh_lines(report: MeshSummary, dimension: int) -> list[str]:
     """The report in sentences."""
     place = "point" if dimension == 2 else "edge"
     lines = [
@@ -149,19 +148,20 @@ def mesh_lines(report: MeshSummary, dimension: int, in_frame: bool = False) -> l
         )
     if report.first:
         lines.append("This is the first mesh: simulate may refine it further, to meet tissue.refine.tolerance.")
-    if report.estimate is not None and report.bound is not None and report.time_error is not None:
-        lines.append(
-            f"The error of the deformation is about {percent(report.estimate)} "
-            f"{'as extrapolated from coarser cells' if report.coarser else 'on this mesh'} "
-            f"(bound {percent(report.bound)}), and {percent(report.time_error)} by the time step."
-        )
-    else:
-        lines.append(
-            "The error of the mesh is not estimated in the frame of the hand."
-            if in_frame
-            else "The error of the mesh is not estimated here, as that takes some time; simulate --certify does it."
-        )
     return lines
+
+
+def error_lines(report: MeshSummary, in_frame: bool = False) -> list[str]:
+    """Error of mesh and time step in one sentence, or why there is none."""
+    if report.estimate is not None and report.bound is not None and report.time_error is not None:
+        return [
+            f"The error of the deformation is about {percent(report.estimate)} "
+            f"{'as extrapolated from coarser cells' if report.coarser else 'on this mesh'}, with a bound of "
+            f"{percent(report.bound)}, and about {percent(report.time_error)} by the time step."
+        ]
+    if in_frame:
+        return ["The error of the mesh is not estimated in the frame of the hand."]
+    return ["The error of the mesh is not estimated here, as that takes some time; simulate --certify does it."]
 
 
 def verdict(effect: EffectReport) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem import Columns, Model, PETSc, Scene, Trajectory, counted, hand_columns, make_outputs
+from softgrasp.fem import Columns, Model, PETSc, Scene, Trajectory, counted, hand_columns, make_outputs, placed
 from softgrasp.study.report import Table
 from softgrasp.study.report.origin import origin, peak_memory_mb
 
@@ -116,7 +116,7 @@ class Simulation:
         each = f"{1e6 * step:.4g} us" if step < 1e-3 else f"{1e3 * step:.4g} ms"
         timed = f"{steps}" if run.steps_timed == steps else f"{run.steps_timed} of {steps}, since the run was resumed,"
         return [
-            ("hand at the end", "(" + ", ".join(f"{x:.6g}" for x in run.q_s[-1]) + ")"),
+            ("hand at the end", placed(run.q_s[-1], self.hand(), 6)),
             *((c.label, f"{y:.6g} {c.unit}") for c, y in zip(run.columns, run.outputs[-1], strict=True)),
             *self.places.items(),
             ("largest force on the hand", ", ".join(loads)),
@@ -134,9 +134,8 @@ class Simulation:
     def summary(self) -> list[str]:
         """What came out, in three sentences."""
         run, sizes = self.run, self.sizes
-        place = ", ".join(f"{x:.4g}" for x in run.q_s[-1])
         lag = np.abs(run.outputs - run.outputs_rigid).max(axis=0, initial=0.0)
-        texts = [f"At t = {run.times[-1]:.4g} s the hand is at ({place})."]
+        texts = [f"At t = {run.times[-1]:.4g} s the hand is at {placed(run.q_s[-1], self.hand(), 4)}."]
         if len(lag):
             i = int(lag.argmax())
             texts.append(

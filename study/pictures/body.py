@@ -244,7 +244,7 @@ def place(q: Array) -> str:
     x, largest = q[:3], float(np.abs(q[:3]).max())
     factor, unit = (1e3, "mm") if largest < 1 else (1.0, "m")
     shown = np.where(np.abs(x) < max(1e-3 * largest, 1e-5), 0.0, factor * x)
-    return f"\nat ({', '.join(f'{float(f"{v:.2g}"):g}' for v in shown)}) {unit}"
+    return f"\n({', '.join(f'{float(f"{v:.2g}"):g}' for v in shown)}) {unit}"
 
 
 def _upright(move: MoveView) -> bool:

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem import Array, Trajectory, hand_columns
+from softgrasp.fem import Array, Trajectory, hand_columns, placed
+from softgrasp.fem.columns import hand_of, label_unit
 from softgrasp.reduction import Certificate, CertifiedModel, Materials, ReducedTrajectory
 from softgrasp.study.report import Table, percent
 
@@ -40,11 +41,14 @@ class CertifiedAnswer:
         c = self.certificate
         if c.passed:
             return ""
+        assert c.tolerance is not None  # else it passes
         ending = (
             "--fallback full runs the full model, --allow prints the answer nevertheless" if self.run is None
             else "the full model ran instead" if self.full else "it is shown because --allow was given"
         )  # fmt: skip
-        return f"The error {c.claim(percent(c.reduction))}, which is above the tolerance {c.tolerance:g}; {ending}."
+        return (
+            f"The error {c.claim(percent(c.reduction))}, which is above the tolerance {percent(c.tolerance)}; {ending}."
+        )
 
     @property
     def warnings(self) -> list[str]:
@@ -105,7 +109,9 @@ class QueryResult:
                   "kind of bound", "estimate", "time step", "mesh"]  # fmt: skip
         names = self.model.fine.outputs.names
         header += [
-            f"{name} {what}" for name in names for what in ("at the end", "largest deformation", "error at most")
+            f"{name} {what} [{label_unit(name)}]"
+            for name in names
+            for what in ("at the end", "largest deformation", "error at most")
         ]
         return Table(tuple(header), [_row(a, len(names)) for a in self.each], "Answers", best=self.worst)
 
@@ -116,10 +122,17 @@ class QueryResult:
         (answer,) = self.each
         run, c, names = answer.shown, answer.certificate, answer.shown.output_names
         hand = hand_columns(run.q_s.shape[1], self.model.norms.dimension)
-        header = ["t [s]", *(f"{x.label} [{x.unit}]" for x in hand), *names]
+        header = [
+            "t [s]",
+            *(f"{x.label} [{x.unit}]" for x in hand),
+            *(f"{name} [{label_unit(name)}]" for name in names),
+        ]
         parts = [run.times, run.q_s, run.outputs]
         if not answer.full:
-            header += [*(f"error of {name} at most" for name in names), "energy norm of the error at most [J^0.5]"]
+            header += [
+                *(f"error of {name} at most [{label_unit(name)}]" for name in names),
+                "energy norm of the error at most [J^0.5]",
+            ]
             parts += [c.outputs.values, c.energy.values]
         return Table(tuple(header), np.column_stack(parts).tolist())
 
@@ -139,12 +152,14 @@ def answer_rows(answer: CertifiedAnswer) -> list[tuple[str, str]]:
     rows = [
         ("parameters", answer.parameters),
         ("answered by", f"{answer.source}, {len(run.times) - 1} steps of {1e3 * (run.times[1] - run.times[0]):.4g} ms"),
-        ("hand at the end", "(" + ", ".join(f"{x:.6g}" for x in run.q_s[-1]) + ")"),
+        ("hand at the end", placed(run.q_s[-1], hand_of(run.q_s.shape[1], run.output_names), 6)),
     ]
     for name, end, most, bound, about in answer.outputs():
-        text = f"{end:.6g} at the end, deformed by {most:.4g} at most"
-        text += "" if bound is None else f"; error at most {bound:.2g} ({c.how})"
-        rows.append((name, text + (f", about {about:.2g} (estimate)" if about is not None and c.proved else "")))
+        unit = label_unit(name)
+        text = f"{end:.6g} {unit} at the end, deformed by {most:.4g} {unit} at most"
+        text += "" if bound is None else f"; error at most {bound:.2g} {unit} ({c.how})"
+        guess = f", about {about:.2g} {unit} (estimate)" if about is not None and c.proved else ""
+        rows.append((name, text + guess))
     if not answer.full:
         first, *rest = c.sentence().split(" | ")
         rows += [("error", f"{first} of the {c.what}"), *(("", text) for text in rest)]

@@ -7,7 +7,7 @@ import re
 import shlex
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from softgrasp.fem import SceneError, counted, no_pipe, parse_toml, read_text
+from softgrasp.fem.errors import shortened
 from softgrasp.fem.scene.text import LARGEST
 from softgrasp.study.report import Page, Section, Table, in_words
 from softgrasp.study.shell import Session, folder_lock, read_result
@@ -26,6 +27,7 @@ COST = re.compile(
 )  # names of times and memory, which differ from run to run
 LONGEST = 6  # entries of a list that is compared entry by entry
 LIST_WIDTH = 200  # [letters]
+MOST_KEYS = 3  # of a run that are listed with their values
 FOREIGN = 5  # files that a list of runs leaves out by name
 
 
@@ -47,21 +49,54 @@ def runs_below(folder: Path) -> tuple[Table, list[Path]]:
     """
     if not folder.is_dir():
         raise SceneError(f"{folder}: there is no such folder; runs write into out/SCENE-COMMAND or where --out says")
-    header = ("folder", "command", "scene", "n_e", "total [s]", "warnings", "ended")
-    found, foreign = [], []
+    header = ("folder", "command", "scene", "differs in", "n_e", "total [s]", "warnings", "ended")
+    found, foreign, kinds = [], [], dict[tuple[str, str], list[dict[str, Any]]]()
     for file in folder.rglob("result.json"):
         if not (r := read_result(file.parent)):
             foreign.append(file)
             continue
         n_e, clock, warnings = r.get("n_e"), r.get("time"), r.get("warnings")
         seconds, ended = clock.get("total") if isinstance(clock, dict) else None, file.stat().st_mtime
+        kind = str(r["command"]), str(r.get("scene", ""))
+        try:
+            keys = _whole(_scene(file.parent / "scene.toml"))
+        except SceneError:
+            keys = {}  # of a damaged scene, whose results are listed all the same
+        kinds.setdefault(kind, []).append(keys)
         row = (
-            str(file.parent), r["command"], str(r.get("scene", "")), n_e if _number(n_e) else None,
+            str(file.parent), *kind, keys, n_e if _number(n_e) else None,
             seconds if _number(seconds) else None, len(warnings) if isinstance(warnings, list) else 0,
             time.strftime("%Y-%m-%d %H:%M", time.localtime(ended)),
         )  # fmt: skip
         found.append((ended, row))
-    return Table(header, [row for _, row in sorted(found, key=lambda pair: pair[0])]), sorted(foreign)
+    varied = {kind: _varied(scenes) for kind, scenes in kinds.items()}
+    rows = [(*row[:3], _values(row[3], varied[row[1], row[2]]), *row[4:]) for _, row in sorted(found, key=_when)]
+    return Table(header, rows), sorted(foreign)
+
+
+def _when(found: tuple[float, Any]) -> float:
+    return found[0]
+
+
+def _whole(keys: dict[str, Any]) -> dict[str, Any]:
+    """Flat keys with lists of numbers as one value each."""
+    whole: dict[str, Any] = {}
+    for name, value in keys.items():
+        base = re.sub(r"\[\d+\]$", "", name)
+        whole[base] = value if base == name else [*whole.get(base, []), value]
+    return whole
+
+
+def _varied(scenes: Sequence[dict[str, Any]]) -> list[str]:
+    """Keys that not all runs of a scene have alike, without its description."""
+    names = dict.fromkeys(name for keys in scenes for name in keys if name != "description")
+    return [name for name in names if any(keys.get(name) != scenes[0].get(name) for keys in scenes)]
+
+
+def _values(keys: dict[str, Any], varied: Sequence[str]) -> str:
+    """Some of the keys that vary, with their values in one run: "material.mu = 35"."""
+    words = [f"{'.'.join(name.split('.')[-2:])} = {shortened(f'{keys[name]}')}" for name in varied if name in keys]
+    return ", ".join(words[:MOST_KEYS]) + (f", {len(words) - MOST_KEYS} more" if len(words) > MOST_KEYS else "")
 
 
 def _number(value: Any) -> bool:

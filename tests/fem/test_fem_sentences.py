@@ -1,4 +1,4 @@
-"""Sentences of `fem` that no other test asks for: the call with the bad input, and what it is told."""
+"""Sentences of `fem` that no other test asks for: the bad call, and the sentence that refuses it."""
 
 from __future__ import annotations
 
@@ -276,6 +276,16 @@ PLANT = ReducedSystem(E, -E, np.ones((2, 1)), E, np.zeros(2), np.zeros((1, 2)), 
 LAYER = "tissue.layers.a={box=[[0, 0], [1, 1]], material='fat', beta=1.0}"
 CSV = "0,0,0\n1,0,0\n"
 SENTENCES: list[tuple[Act, str]] = [
+    (scene("effects.damping={kind='rayleigh', alpha=1.0, beta=0.01, drag='space'}", name="turn_over"),
+     "effects.damping.drag = 'space' cannot go with effects.frame yet; use drag = 'hand'"),
+    (scene("tissue.refine={tolerance=0.01}", name="turn_over"),
+     "tissue.refine.tolerance cannot go with effects.frame, as its estimate leaves out large rotations; drop it"),
+    (scene("tissue.refine={tolerance=0.01}", name="set_down"),
+     "tissue.refine.tolerance cannot go with effects.obstacles, as its estimate leaves them out; drop it"),
+    (scene("time.solver='cg'", name="set_down"), "time.solver is 'cg'; effects.obstacles needs a factor, use 'auto'"),
+    (build(terms="bed"), "terms is 'bed'; give a list of softgrasp.Term(name, form, value)"),
+    (lambda *_: model("control.outputs=[{kind='region', name='far', box=[[8, 8], [9, 9]]}]").outputs,
+     "control.outputs[0].box = [[8.0, 8.0], [9.0, 9.0]] has no free node of the body; move or enlarge it"),
     (lambda *_: sg.gradient(own(solid), lambda y: 0.0), "a gradient is by lambda, mu, rho and beta, and cannot go with "
      "tissue.energy or own terms yet"),
     (lambda folder, _: read_manifest(folder / "a.json", 1), "a.json does not exist; run once without --resume"),

@@ -1,4 +1,4 @@
-"""Sentences of `lqr` that no other test asks for: the call with the bad input, and what it is told."""
+"""Sentences of `lqr` that no other test asks for: the bad call, and the sentence that refuses it."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from petsc4py import PETSc
 import softgrasp as sg
 from softgrasp.lqr.dense import modal
 from softgrasp.lqr.dense.paper import paper_form
-from softgrasp.lqr.design.scene import weight
+from softgrasp.lqr.design.scene import actuation, weight
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.loop.filter import Filter
 from softgrasp.lqr.lowrank import newton, radi
 from softgrasp.lqr.lowrank.shifted import make_shifted
-from softgrasp.lqr.observer.sensors import Noise, make_sensors
+from softgrasp.lqr.observer.sensors import Noise, make_disturbance, make_sensors
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import check_weights
 from softgrasp.lqr.plant.second_order import second_order
 from softgrasp.lqr.reduced.bases import make_family
 from softgrasp.lqr.reduced.retune import Retuner
+from softgrasp.lqr.riccati import modal_lqr
 from tests.helpers.sentences import refused
 
 pytestmark = pytest.mark.serial
@@ -100,6 +101,12 @@ def gyroscopic(*_: Any) -> None:
 
 E = np.eye(2)
 SENTENCES: list[tuple[Act, str]] = [
+    (lambda *_: actuation(sg.build("paper_lqr", [SMALL, "control.loop.limit_torque=1.0"])),
+     "control.loop.limit_torque limits a hand that does not turn; set effects.rotation = true, or leave it out"),
+    (lambda *_: Actuation(rate=10.0, delay=-1).ticks(0.1), "delay = -1 ticks must be 0 or more"),
+    (lambda *_: modal_lqr(problem(), modes=-1), "modal_lqr: modes = -1 must be 0 or more"),
+    (lambda *_: make_disturbance(problem(), 1.0, 1.0, [[8.0, 8.0], [9.0, 9.0]]),
+     "control.observer.disturbance.box = [[8.0, 8.0], [9.0, 9.0]] contains no free node of the body; enlarge it"),
     (lambda *_: check_weights(np.eye(3), E, 2, 2), "Q has the shape (3, 3); it must be (2, 2), one row per output"),
     (lambda *_: check_weights(np.array([[1.0, 2.0], [0.0, 1.0]]), E, 2, 2), "Q is not symmetric; give (Q + Q')/2"),
     (lambda *_: weight([[1.0]], 2, "control.R"), "control.R is 1 x 1; it must be 2 x 2 or one number"),

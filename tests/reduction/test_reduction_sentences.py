@@ -1,4 +1,4 @@
-"""Sentences of `reduction` that no other test asks for: the call with the bad input, and what it is told."""
+"""Sentences of `reduction` that no other test asks for: the bad call, and the sentence that refuses it."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ from softgrasp.reduction.identify.unknowns import parse_unknowns
 from softgrasp.reduction.online import prepared
 from softgrasp.reduction.online import run as run_online
 from softgrasp.reduction.strain.nnls import nnls
+from softgrasp.reduction.strain.training import train
 from tests.helpers.sentences import refused
 
 pytestmark = pytest.mark.serial
@@ -113,6 +114,12 @@ def basis(name: str, **how: Any) -> Act:
 
 
 SENTENCES: list[tuple[Act, str]] = [
+    (lambda *_: MujocoTissue(rom(), None),  # type: ignore[arg-type]
+     "the model is one of small angles; reduce a scene with effects.frame = 'hand'"),
+    (lambda *_: train(made()[0], [], 8), "the scene has no effects.finite_strain; softgrasp.reduce makes its linear "),
+    (lambda *_: train(model("effects.finite_strain={}"), [], 8), "there is no full run to train on; give at least one"),
+    (lambda *_: sg.identify(made()[0], Measurements("a", np.zeros(2), np.zeros((2, 3))), "mu", 1e-3),
+     "a: values have the shape (2, 3); the scene has 2 outputs"),
     (lambda folder, _: sg.save(rom(), below_a_file(folder)), "a.h5 cannot be written (Not a directory); "),
     (damaged, "a.h5 is damaged: it is not what was written; reduce the scene again"),
     (lambda *_: factor(MPI.COMM_SELF, np.eye(2), "fast"), "engine 'fast' is unknown; choose one of "),  # type: ignore[arg-type]

@@ -138,7 +138,8 @@ def test_two_runs_are_listed_and_compared(tmp_path: Path) -> None:
     for name, mu in (("a", 50.0), ("b", 30.0)):
         changes = [*SMALL, f"tissue.material.mu={mu}"]
         run_simulate(SCENE, tmp_path / name, changes, QUIET, quiet=True, pictures=False)
-    assert [Path(row[0]).name for row in runs_below(tmp_path)[0].rows] == ["a", "b"]
+    listed = [(Path(row[0]).name, row[3]) for row in runs_below(tmp_path)[0].rows]
+    assert listed == [("a", "material.mu = 50.0"), ("b", "material.mu = 30.0")]
     comparison = compare(tmp_path / "a", tmp_path / "b")
     assert comparison.keys.rows == [("tissue.material.mu", "50.0", "30.0")]
     numbers = {row[0]: row[1:] for row in comparison.numbers.rows}

@@ -1,4 +1,4 @@
-"""Sentences of `study` that no other test asks for: the call with the bad input, and what it is told."""
+"""Sentences of `study` that no other test asks for: the bad call, and the sentence that refuses it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.precision.points import Request
 from softgrasp.study.precision.run import run_study
-from softgrasp.study.query.request import read_batch
+from softgrasp.study.query.request import parse_settings, read_batch
 from softgrasp.study.query.run import run_query
 from softgrasp.study.reduce.run import run_reduce
 from softgrasp.study.report.document import Table
@@ -80,6 +80,7 @@ def requested(path: str, body: Any, method: str = "POST") -> Act:
 BENT = "effects.finite_strain={law='neo-hooke'}"
 TORN = [*SMALL, "effects.finite_strain={law='stvk'}", "time.end=2e-3"]
 SENTENCES: list[tuple[Act, str]] = [
+    (lambda *_: parse_settings(["mu=1", "mu=2"]), "--set mu=2: mu is set twice; give one value, or many in a table"),
     (lambda folder: run_simulate(SCENE, folder / "out", SMALL, QUIET, resume=True, empty=True),
      "--empty removes what --resume goes on from; give one of them"),
     (lambda _: Request(names=("speed",)), "--question speed: it must be one of "),

@@ -224,9 +224,11 @@ def sweep(
     return MethodSweep(registry.find_method(name), tuple(points), models, sigma, *about)
 
 
-def sweep_all(names: Sequence[str], full: FullRun, say: Say) -> tuple[MethodSweep, ...]:
-    """Every method at all N of the scene. Collective."""
-    options = full.model.scene.reduction
+def sweep_all(
+    names: Sequence[str], full: FullRun, say: Say, options: Reduction | None = None
+) -> tuple[MethodSweep, ...]:
+    """Every method at all N of the options, None for those of the scene. Collective."""
+    options = options or full.model.scene.reduction
     size = len(options.N)
 
     def swept(i: int, done: int, of: int) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
     N_NOTE,
+    POINT_UNITS,
     DomainTests,
     MethodSweep,
     Point,
@@ -188,8 +189,7 @@ def inner_note(sweeps: Sequence[MethodSweep]) -> str:
 
 def point_table(study: ReductionStudy) -> Table:
     """All points, numbers in full."""
-    units = {"spectral_abscissa": " [1/s]", "time_offline": " [s]", "time_setup": " [s]", "time_online": " [s]"}
-    names = tuple(f.name + units.get(f.name, "") for f in fields(Point))
+    names = tuple(f.name + POINT_UNITS.get(f.name, "") for f in fields(Point))
     return Table(("method", *names), [(s.method.key, *astuple(p)) for s in study.sweeps for p in s.points])
 
 

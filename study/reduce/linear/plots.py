@@ -99,6 +99,11 @@ def further_methods(sweeps: Sequence[MethodSweep]) -> list[MethodSweep]:
 def figure_errors(
     sweeps: Sequence[MethodSweep], quantities: Sequence[tuple[str, str]], out_png: Path
 ) -> tuple[Path, ...]:
+    """The picture of :func:`errors_figure` as a file."""
+    return style.save(errors_figure(sweeps, quantities), out_png)
+
+
+def errors_figure(sweeps: Sequence[MethodSweep], quantities: Sequence[tuple[str, str]]) -> Any:
     """Errors against N, one below the other; a curve is dotted where its model is unstable, its name is at its end."""
     single, look = len(quantities) == 1, looks(s.method.key for s in sweeps)
     with style.paper_style():
@@ -122,7 +127,7 @@ def figure_errors(
         axes[-1, 0].set_xlabel("N, columns of the basis")
         if single and (handles := _remarks(sweeps)):
             figure.legend(handles=handles, loc="outside upper left", ncols=2)
-        return style.save(figure, out_png)
+    return figure
 
 
 def figure_times(sweeps: Sequence[MethodSweep], full: float, out_png: Path) -> tuple[Path, ...]:

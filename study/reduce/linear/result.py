@@ -14,6 +14,8 @@ from softgrasp.study.reduce.times import FullTimes, Turns
 
 COMPARED = 14  # N at which methods are compared: the paper's
 LARGER = 30  # N of the second model that is tested at other parameters
+POINT_UNITS = {"spectral_abscissa": " [1/s]", "time_offline": " [s]", "time_setup": " [s]", "time_online": " [s]"}
+"""Units of a point's fields, as they follow its names; the others are shares and counts."""
 N_NOTE = (
     "N counts all columns of V for every method, as in the paper, also the hand's own 2 n_s of bases with fixed solid "
     "modes. V_e: those without the hand's (N_tissue), for componentwise POD displacements + velocities."

@@ -232,6 +232,12 @@ def test_what_does_not_fit_is_refused(small: tuple[ReducedSystem, Shapes, Array]
         Controller(K[:, 1:], x_bar, u_bar, plant)
     with pytest.raises(ControlError, match="period"):
         Controller(K, x_bar, u_bar, plant, period=0.0)
+    controller = Controller(K, x_bar, u_bar, plant)
+    with pytest.raises(ControlError, match="q_s and v_s have 1 and 2 entries; this hand has 2 each"):
+        controller.step(np.zeros(1), np.zeros(2))
+    for wrong in (np.zeros(3), np.full(2, np.nan)):
+        with pytest.raises(ControlError, match="the target must be 2 finite numbers"):
+            controller.towards(wrong)
     with pytest.raises(ReducedSystemError, match="shape"):
         plant.under(K[:1])
     with pytest.raises(ReducedSystemError, match="finite"):
