@@ -114,7 +114,7 @@ def basis(name: str, **how: Any) -> Act:
 
 
 SENTENCES: list[tuple[Act, str]] = [
-    (lambda *_: MujocoTissue(rom(), None),  # type: ignore[arg-type]
+    (lambda *_: MujocoTissue(rom(), None),
      "the model is one of small angles; reduce a scene with effects.frame = 'hand'"),
     (lambda *_: train(made()[0], [], 8), "the scene has no effects.finite_strain; softgrasp.reduce makes its linear "),
     (lambda *_: train(model("effects.finite_strain={}"), [], 8), "there is no full run to train on; give at least one"),
