@@ -227,7 +227,7 @@ class Linearisation:
     sizes: Array  # singular values of the Jacobian, its change per sigma, (k,)
     directions: Array  # rows are its directions of log theta, (k, k)
     residual: Array  # (m,) [sigma]
-    all_deviations: Array  # standard deviations of [log theta, nuisances]
+    whole: Array  # covariance of [log theta, nuisances]
 
 
 def linearise(misfit: Misfit, p: Array, robust: bool) -> Linearisation:
@@ -240,9 +240,7 @@ def linearise(misfit: Misfit, p: Array, robust: bool) -> Linearisation:
     inverse = np.linalg.pinv(apart(root * J, misfit.k)) * root.T
     by_psi, all_by_psi = inverse / slope, whole / slope
     _, sizes, directions = np.linalg.svd(apart(root * J, misfit.k), full_matrices=False)
-    return Linearisation(
-        inverse, (by_psi * psi2) @ by_psi.T, sizes, directions, r, np.sqrt((all_by_psi**2 * psi2).sum(axis=1))
-    )
+    return Linearisation(inverse, (by_psi * psi2) @ by_psi.T, sizes, directions, r, (all_by_psi * psi2) @ all_by_psi.T)
 
 
 def by_experiment(misfit: Misfit, values: Array) -> Iterator[Array]:

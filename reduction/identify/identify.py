@@ -312,12 +312,12 @@ def _answer(solved: Solved, start: Array, asked: Asked) -> Identified:
     own, comm = None if misfit.near.whole_range else misfit.near.size, model.system.layout.comm
     sampled = None
     if asked.posterior:
-        sampled = on_root(comm, lambda: sample(misfit, found.p, line.all_deviations, asked.posterior, robust))
+        sampled = on_root(comm, lambda: sample(misfit, found.p, line.whole, asked.posterior, robust))
     return Identified(
         unknowns=unknowns, start=start, values=values, noise=noise, parts=parts, kinds=kinds, law=solved.law,
         covariance=line.covariance, sight=line.sizes, directions=line.directions,
         assumed={u.name: -line.inverse @ misfit.slopes(found.p, [u])[:, 0] for u in misfit.near.rests_on()},
-        nuisances=_nuisances(misfit.nuisances, found.p[k:], line.all_deviations[k:], data, columns),
+        nuisances=_nuisances(misfit.nuisances, found.p[k:], np.sqrt(np.diag(line.whole)[k:]), data, columns),
         residuals=judged,
         reasons=reasons(unknowns, judged, found.unsettled, unseen(unknowns, line.sizes, line.directions), noise,
             parts, _cures(parts, noise, estimate, model.scene, own), found.edges),

@@ -18,6 +18,15 @@ def determinant(F: Array, k: int) -> Array:
     return np.asarray(whole if F.shape[-1] == k else whole - np.linalg.slogdet(F[..., k:, k:])[1])
 
 
+def ellipsoid(F: Array, k: int) -> Array:
+    """Size of the errors by the information F (..., m, m), det(F)^(-1/2k): the mean semi-axis of their ellipsoid.
+
+    The mean is the geometric one. What is not seen counts as 1e130 at most.
+    """
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.exp(-np.maximum(determinant(F, k), -600.0 * k) / (2 * k)))
+
+
 def choose(F: Array, k: int, count: int) -> list[int]:
     """Numbers of ``count`` of the candidates' F (c, m, m) with a large determinant of their sum, the best first.
 

@@ -15,6 +15,7 @@ from softgrasp.reduction.identify.fit import ROBUST, Misfit
 
 FEWEST = 1000  # samples
 WALKERS = 4  # a parameter
+FARTHEST = 0.1  # largest semi-axis of the walkers' start, in the logarithms
 BURNED = 0.2  # of the steps, before which samples are not counted
 SEED = 0
 MISSING = "--posterior needs the package emcee; pip install 'softgrasp[posterior]', or leave it out"
@@ -41,11 +42,12 @@ def check_posterior(samples: int) -> None:
         raise SceneError(MISSING) from None
 
 
-def sample(misfit: Misfit, p: Array, deviations: Array, samples: int, robust: bool) -> Posterior:
+def sample(misfit: Misfit, p: Array, covariance: Array, samples: int, robust: bool) -> Posterior:
     """Samples around the answer p by the affine invariant ensemble. Online; not collective.
 
     Args:
-        deviations: of [log theta, nuisances], from which the walkers start.
+        covariance: of [log theta, nuisances], by which the walkers start, none farther than some 0.1: a
+            start that ignores correlations lies far outside of a thin ellipsoid.
         samples: number of them, those before the count begins included.
     """
     import emcee
@@ -65,7 +67,9 @@ def sample(misfit: Misfit, p: Array, deviations: Array, samples: int, robust: bo
 
     walkers = max(WALKERS * size, 8)
     random = np.random.RandomState(SEED)
-    begin = p + random.standard_normal((walkers, size)) * np.minimum(deviations, 0.1)
+    values, vectors = np.linalg.eigh(covariance)
+    axes = vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), FARTHEST)
+    begin = p + random.standard_normal((walkers, size)) @ axes.T
     begin[:, :k] = np.clip(begin[:, :k], low + 1e-9, high - 1e-9)
     sampler = emcee.EnsembleSampler(walkers, size, density)
     steps = -(-samples // walkers)

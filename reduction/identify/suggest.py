@@ -24,7 +24,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.shown import Card, Shown, percent
 from softgrasp.reduction.identify.data import Measurements
 from softgrasp.reduction.identify.near import Near, check_identifiable, experiment
-from softgrasp.reduction.identify.optimal import choose, determinant, deviations, unseen_directions
+from softgrasp.reduction.identify.optimal import choose, deviations, ellipsoid, unseen_directions
 from softgrasp.reduction.identify.unknowns import Unknown, parse_unknowns, value_of
 from softgrasp.reduction.identify.verdict import direction_in_words
 
@@ -39,13 +39,10 @@ class MotionPlan:
     chosen: tuple[int, ...]  # numbers of the candidates, the best first
     deviations: Array  # of the parameters with the first j of them, relative, (markers, k)
     own: Array  # of the parameters with the outputs of the scene, relative, (k,)
-    alone: Array  # size of the errors with each candidate alone: geometric mean of their ellipsoid, (candidates,)
+    by_one: Array  # of the parameters with each candidate alone, relative, (candidates, k)
+    alone: Array  # size of the errors with each candidate alone, det(F)^(-1/2k), (candidates,) [1]
+    size: float  # of the errors with all its markers, det(F)^(-1/2k): what the motions are ranked by [1]
     hidden: tuple[str, ...]  # combinations of the parameters that its markers do not determine, in words
-
-    @property
-    def size(self) -> float:
-        """Geometric mean of the deviations with all its markers: what the motions are ranked by [1]."""
-        return float(np.exp(np.log(np.maximum(self.deviations[-1], 1e-300)).mean()))
 
 
 @dataclass(frozen=True, repr=False)
@@ -102,8 +99,8 @@ def suggest_markers(
     """F = sum_i J_i'J_i over K boundary points, of the largest det F, for each motion [F72]. Collective.
 
     J_i = (dy_i/dlog theta) / sigma of a marker i; the standard deviations of log theta are the roots of diag F^-1.
-    Points are chosen greedily, then exchanged one by one. The errors are those by the noise at the values of the model;
-    a fit adds those of mesh, time step and reduction.
+    Points are chosen greedily, then exchanged one by one; motions are ranked by det F of their points. The errors are
+    those by the noise at the values of the model; a fit adds those of mesh, time step and reduction.
 
     >>> import softgrasp as sg
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
@@ -152,7 +149,7 @@ def suggest_markers(
         _plan(near, own, values, moved(model.scene, motion), dict(motion), noise, rate, offset, shift, K)
         for motion in (motions or ({},))
     ]
-    plans.sort(key=lambda plan: plan.size)
+    plans.sort(key=lambda plan: (len(plan.hidden), plan.size))
     chosen = points[list(plans[0].chosen)]
     scene = with_markers(moved(model.scene, plans[0].motion), chosen)
     return SuggestedMarkers(unknowns, values, points, tuple(plans), scene)
@@ -182,12 +179,10 @@ def _plan(
     chosen = choose(of_points, k, K)
     so_far = np.cumsum(of_points[chosen], axis=0)
     ours = information(own, values, scene, noise, rate, offset, shift).sum(axis=0)
-    with np.errstate(divide="ignore"):
-        alone = np.exp(-np.maximum(determinant(of_points, k), -600.0 * k) / (2 * k))
     hidden = tuple(direction_in_words(near.unknowns, x) for x in unseen_directions(so_far[-1], k))
-    return MotionPlan(
-        motion, tuple(chosen), np.array([deviations(each, k) for each in so_far]), deviations(ours, k), alone, hidden
-    )
+    all_of, by_one = (np.array([deviations(each, k) for each in some]) for some in (so_far, of_points))
+    sizes = ellipsoid(of_points, k), float(ellipsoid(so_far[-1], k))
+    return MotionPlan(motion, tuple(chosen), all_of, deviations(ours, k), by_one, *sizes, hidden)
 
 
 def information(

@@ -15,9 +15,10 @@ from softgrasp.study.shell import Session
 from softgrasp.study.shell.session import Page
 
 CAPTIONS = {
-    "markers.png": "Candidates on the boundary by the size of the errors that each would give alone (geometric mean "
-    "over the parameters), and the chosen markers in the order of what they add.",
+    "markers.png": "Candidates on the boundary by the size of the errors that each would give alone (mean semi-axis "
+    "of their ellipsoid), and the chosen markers in the order of what they add.",
 }
+MOST_ROWS = 10  # candidates on the page
 BARS = "Standard deviations by the noise, of all parameters fitted together, with the markers up to that line."
 
 
@@ -35,7 +36,12 @@ def compose(answer: SuggestedMarkers, picture: PictureMesh | None, session: Sess
         Section("", figures=captioned(drawn, CAPTIONS)),
         marker_table(answer).section(BARS, terminal=True),
         motion_table(answer).section(
-            "Each motion with its own markers, beside what the outputs of the scene would give.", terminal=True
+            "Ranked by the size of the errors with the motion's own markers, the mean semi-axis of their ellipsoid; "
+            "beside it what the outputs of the scene would give.",
+            terminal=True,
+        ),
+        candidate_table(answer, MOST_ROWS).section(
+            "The best candidates, each as the only marker, by the size of the errors; candidates.csv has all."
         ),
     ]
     return Page(
@@ -71,6 +77,7 @@ def motion_table(answer: SuggestedMarkers) -> Table:
     rows = [
         (
             motion_words(plan),
+            "not seen" if plan.hidden else Share(plan.size),
             *_bars(plan.deviations[-1]),
             *_bars(plan.own),
             " ".join(place(answer.points[i]) for i in plan.chosen),
@@ -78,7 +85,7 @@ def motion_table(answer: SuggestedMarkers) -> Table:
         for plan in answer.motions
     ]
     names = [u.name for u in answer.unknowns]
-    header = ("motion", *names, *(f"{name}, scene's outputs" for name in names), "markers [m]")
+    header = ("motion", "size", *names, *(f"{name}, scene's outputs" for name in names), "markers [m]")
     return Table(header, rows, "Motions")
 
 
@@ -87,10 +94,20 @@ def motion_words(plan: MotionPlan) -> str:
     return ", ".join(f"{key} = {value}" for key, value in plan.motion.items()) or "the scene's"
 
 
-def candidate_table(answer: SuggestedMarkers) -> Table:
-    """Every candidate with the size of the errors that it gives alone."""
-    rows = [(*(float(c) for c in x), float(a)) for x, a in zip(answer.points, answer.motions[0].alone, strict=True)]
-    return Table((*axes(answer), "error alone [1]"), rows, "Candidates")
+def candidate_table(answer: SuggestedMarkers, most: int | None = None) -> Table:
+    """The candidates, the best first, with the errors that each gives alone; ``most``: no more of them."""
+    plan = answer.motions[0]
+    seen = np.isfinite(plan.by_one).all(axis=1)
+    order = np.lexsort((np.where(seen, plan.alone, np.inf), ~seen))[:most]
+    rows = [
+        (
+            *(float(c) for c in answer.points[i]),
+            Share(float(plan.alone[i])) if seen[i] else "not seen",
+            *_bars(plan.by_one[i]),
+        )
+        for i in order
+    ]
+    return Table((*axes(answer), "size", *(u.name for u in answer.unknowns)), rows, "Candidates")
 
 
 def summary(answer: SuggestedMarkers) -> list[str]:
@@ -128,6 +145,7 @@ def result_of(answer: SuggestedMarkers) -> dict[str, Any]:
                     for i, s in zip(plan.chosen, plan.deviations, strict=True)
                 ],
                 "outputs": bars(plan.own),
+                "size": None if plan.hidden else plan.size,
             }
             for plan in answer.motions
         ],

@@ -44,6 +44,6 @@ def draw(answer: SuggestedMarkers, picture: PictureMesh, out: Path) -> list[Path
         ax.set(xlabel="x [m]" if flat else "", ylabel="y [m]" if flat else "")
         if not flat:
             ax.set_axis_off()
-        bar = figure.colorbar(dots, ax=ax, label="error with this marker alone [%]", shrink=0.8)
+        bar = figure.colorbar(dots, ax=ax, label="size of the errors with this marker alone [%]", shrink=0.8)
         few_ticks(bar.ax.yaxis)
         return [*save(figure, out / "markers.png")]

@@ -65,6 +65,7 @@ def test_errors_are_those_of_a_fit_with_these_markers(beside: dict[str, bool]) -
     found = sg.identify(measured, Measurements("markers", run.times, y), "mu,beta", 2e-3, N=30, **beside)
     # the fit's errors are those at its own values, one or two of these errors away
     np.testing.assert_allclose(found.noise, plan.motions[0].deviations[-1], rtol=0.05)
+    assert plan.motions[0].size == pytest.approx(np.linalg.det(found.covariance[:2, :2]) ** (1 / 4), rel=0.05)
     assert [o.name for o in measured.outputs] == ["m1", "m2"]
 
 
@@ -75,6 +76,11 @@ def test_motions_rates_and_what_is_not_seen() -> None:
     found = sg.suggest_markers(model, "mu,beta", 1e-2, 1, motions=family, N=20)
     assert found.motions[0].motion == {"duration": 1.0}
     assert [m.size for m in found.motions] == sorted(m.size for m in found.motions)
+    # of two parameters: det of the covariance is at most the product of both variances, equal where nothing correlates
+    assert all(m.size < np.sqrt(np.prod(m.deviations[-1])) for m in found.motions)
+    best = int(np.argmin(found.motions[0].alone))
+    assert (best,) == found.motions[0].chosen
+    np.testing.assert_allclose(found.motions[0].by_one[best], found.motions[0].deviations[0], rtol=1e-12)  # the same F
     fast = sg.suggest_markers(model, "mu,beta", 1e-2, 1, motions=family, N=20, rate=4 * 80 / 1.0)
     np.testing.assert_allclose(fast.motions[0].deviations, found.motions[0].deviations / 2, rtol=1e-12)  # 1 / sqrt(4)
     hidden = sg.suggest_markers(model, "mu,lambda,rho", 1e-2, 3, N=20)

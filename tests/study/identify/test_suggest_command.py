@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
@@ -34,6 +35,12 @@ def test_files_of_a_plan(tmp_path: Path) -> None:
     assert [each["motion"]["duration"] for each in result["motions"]] == [1, 2]
     best = result["motions"][0]["markers"]
     assert best[1]["deviations"]["mu"] < best[0]["deviations"]["mu"]
+    assert result["motions"][0]["size"] < result["motions"][1]["size"]
+    rows = list(csv.DictReader((out / "candidates.csv").open()))
+    sizes = [float(row["size"]) for row in rows if row["size"] != "not seen"]
+    assert (len(rows), sizes) == (result["candidates"], sorted(sizes))
+    assert [float(rows[0][key]) for key in ("x [m]", "y [m]")] == best[0]["point"]
+    assert float(rows[0]["mu"]) == pytest.approx(best[0]["deviations"]["mu"])
     planned = sg.build(out / "markers.toml")
     assert [list(o.point) for o in planned.outputs] == [each["point"] for each in best]
     assert np.isclose(planned.scene.time_end, 1.0)
