@@ -28,6 +28,7 @@ from softgrasp.fem.shown import counted
 
 FORMAT = 7
 FRICTION = 3  # form of the sets of friction in them
+STRAIN = 2  # form of the iteration at finite strain or in a frame
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # keys of [output] that change no number of a run
 FREE = ("name", "description", "reduction", "study")
 OLD = ("*step*-rank*", "*frame*.npz")  # patterns of the files that a new manifest makes useless
@@ -107,7 +108,7 @@ def _write_manifest(state: RestartState, scene: Scene, manifest: Path, files: li
         "legs": state.legs,
         "files": files,
         "beside": state.beside,
-        **({"friction": FRICTION} if _rubs(scene) else {}),
+        **_forms(scene),
     }
     try:
         write_manifest(manifest, entry)
@@ -162,11 +163,12 @@ def _fitting(scene: Scene, ranks: int, manifest: Path, entry: dict[str, Any]) ->
     """
     _same_ranks(manifest, entry, ranks)
     if entry["scene_hash"] == _numbers_hash(scene):
-        if _rubs(scene) and entry.get("friction") != FRICTION:
-            raise CheckpointError(
-                f"{manifest} was written by another version of softgrasp, which continues friction in another form; "
-                f"{AGAIN}"
-            )
+        for name, form in _forms(scene).items():
+            if entry.get(name) != form:
+                raise CheckpointError(
+                    f"{manifest} was written by another version of softgrasp, which continues "
+                    f"{name.replace('_', ' ')} in another form; {AGAIN}"
+                )
         return entry
     before, now = _flat(entry["scene"]), _flat(scene.model_dump(mode="json", by_alias=True))
     keys = [*now, *(key for key in before if key not in now)]
@@ -182,9 +184,12 @@ def _fitting(scene: Scene, ranks: int, manifest: Path, entry: dict[str, Any]) ->
     )
 
 
-def _rubs(scene: Scene) -> bool:
-    """Whether a run of the scene keeps sets of friction."""
-    return bool(scene.effects.obstacles) and any(entry.friction for entry in scene.obstacle or [])
+def _forms(scene: Scene) -> dict[str, int]:
+    """Form of what the iterations of a run of the scene carry on, by its name in the manifest; empty without any."""
+    effects = scene.effects
+    rubs = bool(effects.obstacles) and any(entry.friction for entry in scene.obstacle or [])
+    iterates = effects.finite_strain is not None or effects.frame is not None
+    return ({"friction": FRICTION} if rubs else {}) | ({"finite_strain": STRAIN} if iterates else {})
 
 
 def _numbering(layout: BlockLayout) -> Array:

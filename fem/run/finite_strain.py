@@ -23,12 +23,12 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, combine, driven_by_root, total
 from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState, viscosity
+from softgrasp.fem.solve.guess import STEPS, extrapolated
 from softgrasp.fem.strain.body import HyperelasticBody
 from softgrasp.fem.strain.newton import Counts, NewtonFigures, Pairs, QuasiNewton, Root
 from softgrasp.fem.strain.points import whole_points
 
 MOST_SUBSTEPS = 16  # largest number of substeps of a step [1]
-KEPT = 2  # steps that the first guess is extrapolated from [1]
 Begin = tuple[PETSc.Vec, Array, Array, float]  # z, s pi, v / s on the rows here, and the dissipated energy [J]
 
 
@@ -61,9 +61,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.trial, self.f, self.y, self.solved = (self.w.duplicate() for _ in range(4))
         vectors = (self.trial, self.f, self.y, self.solved)
         self.trial_array, self.f_array, self.y_array, self.solved_array = (x.array_w for x in vectors)
-        pairs = Pairs(self._dots, len(self.w_array))
-        self.newton = self._make_iteration(pairs)
-        self.past: deque[Array] = deque(maxlen=KEPT)
+        self.newton = self._make_iteration(Pairs(self._dots, len(self.w_array)))
+        self.past: deque[Array] = deque(maxlen=STEPS)
         self.tangent_at: Array | None = None
         self.counts, self.refactor_cost = Counts(), self._refactor_cost()
         self.substeps, self.jump, self.feedback = 1, None, None
@@ -110,6 +109,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         """Set s pi_n = s M v and the law at z; the tangent there unless z = 0. Collective."""
         self._set_momentum(state)
         self.past.clear()
+        self.newton.pairs.clear()
         z = self.at.array_r.copy()
         if self.dot(z, z) > 0 or self.tangent_at is not None:
             self._renew(z)
@@ -145,29 +145,25 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     def restart_arrays(self) -> dict[str, Array]:
         """Further arrays of a restart file: point of the tangent, last steps and pairs by rows, and counts."""
-        pairs = self.newton.pairs
-        tangent = [] if self.tangent_at is None else [self.tangent_at]
+        tangent, pairs = [] if self.tangent_at is None else [self.tangent_at], self.newton.pairs
         rows = [self.operators.leave(x) for x in (*tangent, *self.past, *pairs.dx, *pairs.dr)]
-        sizes = [len(tangent), len(self.past), len(pairs.order), pairs.order[-1] if pairs.order else 0]
-        numbers = np.array([*sizes, *vars(self.counts).values()], dtype=float)
+        numbers = np.array([len(tangent), len(self.past), *vars(self.counts).values()], dtype=float)
         return {"solver_rows": np.array(rows).reshape(len(rows), len(self.r_array)), "solver_numbers": numbers}
 
     def restore(self, rows: Array | None, numbers: Array | None) -> None:
         """Continue with what :meth:`restart_arrays` returned, after :meth:`adopt`. Collective."""
         if rows is None or numbers is None:
             return
-        tangents, past, count, newest = (int(n) for n in numbers[:4])
+        tangents, past = (int(n) for n in numbers[:2])
         kept = [self.operators.enter(x) for x in rows]
         if tangents:
             self._renew(kept[0])
-        self.past = deque(kept[tangents : tangents + past], maxlen=KEPT)
-        pairs = self.newton.pairs
-        at = tangents + past
+        at, pairs = tangents + past, self.newton.pairs
+        self.past = deque(kept[tangents:at], maxlen=STEPS)
         pairs.dx[:], pairs.dr[:] = kept[at : at + len(pairs.dx)], kept[at + len(pairs.dx) :]
-        pairs.order = [(newest - i) % len(pairs.dx) for i in reversed(range(count))]
-        for slot in pairs.order:
+        for slot in range(len(pairs.dx)):
             pairs.multiply(slot)
-        for (name, kind), value in zip(Counts.__annotations__.items(), numbers[4:], strict=True):
+        for (name, kind), value in zip(Counts.__annotations__.items(), numbers[2:], strict=True):
             setattr(self.counts, name, int(value) if kind == "int" else float(value))
 
     # ---- a step
@@ -190,8 +186,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.load = self._load(c)
         self.right = self.r_array + self.load
         counts.scale = max(counts.scale, math.sqrt(self.dot(self.right, self.right)))
-        past = self.past
-        guess = 2 * past[0] - past[1] if len(past) == KEPT else past[0] if past else np.zeros_like(self.w_array)
+        guess = extrapolated(self.past, self.dot) if self.past else np.zeros_like(self.w_array)
         if counts.first >= 0 and counts.iterations_since_factor >= self.refactor_cost:
             self._renew_about(guess)
         root = self._find(guess)
@@ -208,27 +203,32 @@ class FiniteStrainMidpoint(TissueMidpoint):
         counts.iterations, counts.steps = counts.iterations + root.iterations, counts.steps + 1
         counts.most = max(counts.most, root.iterations)
 
-    def _find(self, guess: Array) -> Root:
-        """The root, moved to w'R = 0 by a small fraction of an earlier correction. Collective."""
+    def _find(self, guess: Array, least: int = 0) -> Root:
+        """The root, moved to w'R = 0 if it took ``least`` iterations or more. Collective."""
         target = max(self.tol * self.substeps * self.counts.scale, 4 * self.body.rounding)
         root = self.newton.find(guess, target)
-        if root.iterations > 0 and (moved := self._balance(root)) is None:  # the residual does work: iterate on
+        moved = self._balance(root) if root.iterations >= least else None
+        if root.iterations >= least and moved is None:  # the residual does work: iterate on
             finer = self.newton.find(root.x, max(target / 30, 4 * self.body.rounding))
             root = root if finer.iterations < 0 else finer._replace(iterations=root.iterations + finer.iterations)
             moved = self._balance(root)
         self.last = root.norm / (self.substeps * self.counts.scale) if self.counts.scale > 0 else 0.0
-        return root if root.iterations < 1 or moved is None else root._replace(x=moved)
+        return root if moved is None else root._replace(x=moved)
 
     def _balance(self, root: Root) -> Array | None:
-        """The step w moved to w'R = 0 by a small fraction of an earlier correction; None without a large enough one."""
-        pairs = self.newton.pairs
-        if not pairs.order:
-            return None
-        slopes, work = self._dots(pairs.dr, root.x), self.dot(root.x, root.R)
+        """The step w moved to w'R = 0 by a fraction of a correction, of earlier steps too; None if none is large."""
+        pairs, work = self.newton.pairs, self.dot(root.x, root.R)
+        if work == 0:
+            return root.x
+        bends = np.diag(pairs.products)  # dx'dr: w'R changes by -t (w'dr + dx'R) + t^2 dx'dr from w to w - t dx
+        slopes = self._dots(pairs.dr, root.x) + self._dots(pairs.dx, root.R)
         i = int(np.argmax(np.abs(slopes)))  # zero in an empty slot
         if abs(work) >= 0.1 * abs(slopes[i]):
             return None
-        return np.asarray(root.x - work / slopes[i] * pairs.dx[i])
+        t = work / slopes[i]
+        for _ in range(3):  # each adds two digits
+            t = work / (slopes[i] - t * bends[i])
+        return np.asarray(root.x - t * pairs.dx[i])
 
     def _residual(self, w: Array) -> tuple[Array, float]:
         """R(w) and its norm, infinite where the law has no stress. Collective."""
@@ -299,7 +299,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
             root = self._substeps(c, begin) if feedback is None else self._balanced(c, feedback, begin)
             if root is None:
                 continue
-            self.substeps, self.past = 1, deque(maxlen=KEPT)
+            self.substeps, self.past = 1, deque(maxlen=STEPS)
             self.counts.substepped += 1
             self._renew_about(root.x)
             return root
@@ -375,6 +375,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         if self.jump is None:
             self._add_momentum()
             self.past.appendleft(self.w_array.copy())
+        self.newton.pairs.retire()
         self._arrive(z)
 
     def _add_momentum(self) -> None:

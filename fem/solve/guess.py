@@ -1,4 +1,4 @@
-"""A first guess for S w = r from the last solutions, the best in their span [F98].
+"""First guesses: for S w = r from the last solutions, the best in their span [F98], and for the next of a sequence.
 
 With W the last w's, w_0 = W c minimises |w_0 - S^-1 r| in the norm of S where (W'S W) c = W'r; the product S w comes
 with each solve, so that a guess needs vectors only.
@@ -6,12 +6,17 @@ with each solve, so that a guess needs vectors only.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, normalising, total
 
 COLUMNS = 8  # number of kept solutions [1]: with half of them iterations are a half more, with twice as many no fewer
+STEPS = 5  # members that a sequence is extrapolated from: those of a cubic, and one to compare with [1]
+BETTER = 0.5  # error of a polynomial over that of a lower degree, from which it is preferred [1]
 DEPENDENT = 1e-12  # squared length of a direction over the largest, below which it is rounding [1]
 
 
@@ -48,3 +53,22 @@ class Previous:
         """Remove all solutions."""
         self.count = 0
         self.W[:], self.gram[:] = 0.0, 0.0
+
+
+def extrapolated(past: Sequence[Array], dot: Callable[[Array, Array], float]) -> Array:
+    """The next of x_1, x_2, .. by the line, parabola or cubic through the last of them, (n,). Collective if ``dot`` is.
+
+    The polynomial of degree k misses x_1 by the difference of order k + 1 of x_1, x_2, ..: the degree with the
+    smallest miss is taken, a higher one only where it halves the miss, as it magnifies what alternates.
+
+    Args:
+        past: x_1, x_2, .., the latest first, one at least, (n,) each.
+        dot: inner product of two of them.
+    """
+    rows, differences = list(past), [past[0]]
+    while len(rows) > 1:
+        rows = [a - b for a, b in pairwise(rows)]
+        differences.append(rows[0])
+    misses = [dot(x, x) / BETTER ** (2 * k) for k, x in enumerate(differences[2:])]  # of degrees 1, 2, ..
+    degree = int(np.argmin(misses)) + 1 if misses else len(past) - 1
+    return np.asarray(sum(differences[1 : degree + 1], differences[0]))

@@ -63,7 +63,7 @@ class Pairs:
     Attributes:
         dx: correction of each slot, zero in an empty one, (PAIRS, rows).
         dr: change of R by the correction of each slot, (PAIRS, rows).
-        order: slots in use, that of the oldest pair first.
+        order: slots of the pairs of this step, that of the oldest first; the others hold earlier pairs.
         products: dx_i'dr_j for a pair i older than j, (PAIRS, PAIRS).
     """
 
@@ -75,7 +75,11 @@ class Pairs:
     def clear(self) -> None:
         """Remove all pairs."""
         self.order = []
-        self.dx[:] = self.dr[:] = 0.0
+        self.dx[:] = self.dr[:] = self.products[:] = 0.0
+
+    def retire(self) -> None:
+        """End a step: :meth:`improve` leaves its pairs out, as it would magnify rounding from step to step."""
+        self.order = []
 
     def append(self, dx: Array, dr: Array) -> None:
         """Keep a pair of positive curvature dx'dr in the slot of the oldest one. Collective."""
@@ -112,7 +116,7 @@ class QuasiNewton:
     residual: Callable[[Array], tuple[Array, float]]  # x -> R(x) and |R|, infinite or NaN where R does not exist
     solve: Callable[[Array], Array]  # q -> S^-1 q for the tangent S factored last, to its tolerance
     renew: Callable[[Array], bool]  # x -> whether the tangent at x was factored
-    pairs: Pairs  # L-BFGS pairs of the iterations so far
+    pairs: Pairs  # L-BFGS pairs of the iterations of the step so far
 
     def find(self, x: Array, target: float) -> Root:
         """Iterate from x until |R| <= target, halving corrections with R not finite or fourfold. Collective."""

@@ -366,7 +366,7 @@ SENTENCES: list[tuple[Act, str]] = [
      "pyMOR is not installed; `pip install pymor` brings it"),
     (lacking("control", PLANT.to_control), "python-control is not installed; `pip install control` brings it"),
     (pressed(jump=1), "contact at finite strain cannot act in a step that is divided into substeps; raise time.steps"),
-    (pressed(jump=None, _find=lambda _: SimpleNamespace(iterations=-1)),
+    (pressed(jump=None, _find=lambda *_, **__: SimpleNamespace(iterations=-1)),
      "contact at finite strain (stvk): the step does not converge under the forces of the obstacles; raise "),
     (no_root, "the step does not converge, with |R| at "),
     (in_the_way("snapshots-rank0.h5"), "; choose another --out"),

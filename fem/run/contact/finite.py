@@ -44,7 +44,7 @@ class FiniteContactMidpoint(Touching, FiniteStrainMidpoint):
                 "contact at finite strain cannot act in a step that is divided into substeps; raise time.steps"
             )
         self.right = self.free_load + pressing
-        root = self._find(self.w_array + change)
+        root = self._find(self.w_array + change, least=1)
         if root.iterations < 0:
             raise SolverError(
                 f"contact at finite strain ({self.body.law.name}): the step does not converge under the forces of the "

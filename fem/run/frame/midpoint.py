@@ -30,9 +30,10 @@ from softgrasp.fem.frame.balance import HandBalance, HandPlace, Travel
 from softgrasp.fem.frame.integrals import Sums, crossed, row_length, square
 from softgrasp.fem.frame.rotation import cross_matrix, spatial
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.finite_strain import KEPT, FiniteStrainMidpoint
+from softgrasp.fem.run.finite_strain import FiniteStrainMidpoint
 from softgrasp.fem.run.frame.law import FixedPoint, LinearBody
 from softgrasp.fem.run.midpoint import Feedback, TissueState
+from softgrasp.fem.solve.guess import extrapolated
 from softgrasp.fem.strain.newton import Pairs, Root
 
 LINEAR_TOL = 1e-12  # of a step at small strain, over the largest load: what a factor leaves of a solve
@@ -209,8 +210,7 @@ class TurningStep(FiniteStrainMidpoint):
         self.turn, self.feedback, self.jump, counts = turn, feedback, None, self.counts
         self.inertia.mult(self.at, self.y)
         self.held_inertia = np.array(self.y_array)
-        past = self.past
-        guess = 2 * past[0] - past[1] if len(past) == KEPT else past[0] if past else np.zeros_like(self.w_array)
+        guess = extrapolated(self.past, self.dot) if self.past else np.zeros_like(self.w_array)
         if counts.first >= 0 and counts.iterations_since_factor >= self.refactor_cost:
             self._renew_about(guess)
         self._residual(guess)
@@ -292,7 +292,7 @@ class LinearTurningStep(TurningStep):
         """There is one factor."""
         return False
 
-    def _find(self, guess: Array) -> Root:
+    def _find(self, guess: Array, least: int = 0) -> Root:
         target = max(self.tol * self.counts.scale, 8 * self.body.rounding)
         root: Root = self.newton.find(guess, target)
         self.last = root.norm / self.counts.scale if self.counts.scale > 0 else 0.0

@@ -13,9 +13,11 @@ import pytest
 import skfem
 from mpi4py import MPI
 
-from softgrasp.fem.errors import Interrupted, SolverError
+from softgrasp.fem.checksums import read_manifest, write_manifest
+from softgrasp.fem.errors import CheckpointError, Interrupted, Paused, SolverError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import total
+from softgrasp.fem.run.checkpoint import FORMAT
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.solve.statics import equilibrium
@@ -131,6 +133,27 @@ def test_ranks_and_solvers_agree(solver: str) -> None:
     alone = finite(few, tol=1e-11, comm=MPI.COMM_SELF)
     model = finite(few, tol=1e-11, time={"solver": solver, "reproducible": False, "rtol": 1e-12})
     assert close(last(model, simulate(model)), last(alone, simulate(alone))) < 1e-8
+
+
+@pytest.mark.serial
+def test_a_restart_file_of_another_iteration_is_refused(tmp_path: Path) -> None:
+    """What steps carry on had another form in earlier versions; a linear run carries nothing."""
+    manifest = tmp_path / "checkpoint/checkpoint.json"
+    for model, iterates in ((finite(), True), (build(make_scene()), False)):
+        with pytest.raises(Paused):
+            simulate(model, RunOptions(tmp_path, until=3))
+        entry = read_manifest(manifest, FORMAT)
+        assert ("finite_strain" in entry) is iterates
+    with pytest.raises(Paused):
+        simulate(finite(), RunOptions(tmp_path, until=3))
+    entry = read_manifest(manifest, FORMAT)
+    write_manifest(manifest, {**entry, "finite_strain": 1})
+    with pytest.raises(CheckpointError) as error:
+        simulate(finite(), RunOptions(tmp_path, resume=True))
+    assert str(error.value) == (
+        f"{manifest} was written by another version of softgrasp, which continues finite strain in another form; run "
+        "again without --resume"
+    )
 
 
 @pytest.mark.ranks
