@@ -19,6 +19,7 @@ import pytest
 from mpi4py import MPI
 from rich.console import Console
 
+from softgrasp.fem.columns import label_unit
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.trajectory import Trajectory
@@ -141,14 +142,15 @@ def ratios(name: str, asked: Question, folder: Path) -> dict[str, list[float]]:
         found["energy"].append(float(run.certificate.energy.largest) / error.max())
         largest = np.abs(trajectory.outputs).max()
         for j, label in enumerate(trajectory.output_names):
+            unit = f"[{label_unit(label)}]"
             if settings:
-                off = np.abs(table[label].astype(float) - trajectory.outputs[:, j])
-                bound = table[f"error of {label} at most"].astype(float)
+                off = np.abs(table[f"{label} {unit}"].astype(float) - trajectory.outputs[:, j])
+                bound = table[f"error of {label} at most {unit}"].astype(float)
                 energy = table["energy norm of the error at most [J^0.5]"].astype(float)
                 assert (energy >= error - ROUNDING * size).all(), asked
             else:
                 off = np.abs(run.trajectory.outputs[:, j] - trajectory.outputs[:, j]).max()
-                bound = table[f"{label} error at most"].astype(float)[i]
+                bound = table[f"{label} error at most {unit}"].astype(float)[i]
                 assert float(table["error at most"][i]) >= error.max() / size - ROUNDING, asked
             assert (bound >= off - ROUNDING * largest).all(), asked
             found["outputs"].append(float(np.max(bound) / np.max(off)))
