@@ -6,11 +6,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.columns import Array, Columns, hand_of, labels
+from softgrasp.fem.columns import Array, Columns, hand_of
 from softgrasp.fem.errors import SoftgraspError
 
 
@@ -105,46 +105,6 @@ class Labelled(ABC):
             for j, (label, unit) in enumerate(zip(q.labels, q.units, strict=True)):
                 columns[f"{f'{name} {label}'.strip()} [{unit}]"] = values[:, j]
         return pandas.DataFrame(columns, index=pandas.Index(self.times, name="time [s]"))
-
-
-class FullOrderRun(Labelled):
-    """A run of the full model, whose outputs have columns."""
-
-    LOAD: ClassVar[str]
-    """Name of the field with the force on the hand in each step."""
-    outputs: Array
-    """Outputs, (steps + 1, p) [m, rad]."""
-    outputs_rigid: Array
-    """Outputs of tissue that moves rigidly with the hand, (steps + 1, p) [m, rad]."""
-    columns: Columns
-    """Name, axis and unit of each output component, p."""
-    q_s: Array
-    """Displacement of the hand, (steps + 1, n_s) [m, rad]."""
-    v_s: Array
-    """Velocity of the hand, (steps + 1, n_s) [m/s, rad/s]."""
-    energy: Array
-    """Energy of the deformation, (steps + 1,) [J]."""
-    dissipated: Array
-    """Energy dissipated by damping, (steps + 1,) [J]."""
-
-    @property
-    def output_names(self) -> tuple[str, ...]:
-        """Labels of the columns."""
-        return labels(self.columns)
-
-    @property
-    def quantities(self) -> dict[str, Quantity]:
-        """Outputs, hand, its force and energies over time with their labels and units."""
-        names = self.output_names
-        return {
-            "outputs": of_columns(self.outputs, self.columns, "output"),
-            "outputs_rigid": of_columns(self.outputs_rigid, self.columns, "output"),
-            "q_s": of_hand(self.q_s, names),
-            "v_s": of_hand(self.v_s, names, rate="/s"),
-            self.LOAD: of_hand(getattr(self, self.LOAD), names, load=True),
-            "energy": of_energy(self.energy),
-            "dissipated": of_energy(self.dissipated),
-        }
 
 
 def table(rows: Iterable[Mapping[str, Any]]) -> Any:

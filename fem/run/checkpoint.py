@@ -28,7 +28,7 @@ from softgrasp.fem.shown import counted
 
 FORMAT = 7
 FRICTION = 3  # form of the sets of friction in them
-STRAIN = 2  # form of the iteration at finite strain or in a frame
+ITERATIONS = 2  # form of the iterations of steps at finite strain or in a frame
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # keys of [output] that change no number of a run
 FREE = ("name", "description", "reduction", "study")
 OLD = ("*step*-rank*", "*frame*.npz")  # patterns of the files that a new manifest makes useless
@@ -167,7 +167,7 @@ def _fitting(scene: Scene, ranks: int, manifest: Path, entry: dict[str, Any]) ->
             if entry.get(name) != form:
                 raise CheckpointError(
                     f"{manifest} was written by another version of softgrasp, which continues "
-                    f"{name.replace('_', ' ')} in another form; {AGAIN}"
+                    f"{name} in another form; {AGAIN}"
                 )
         return entry
     before, now = _flat(entry["scene"]), _flat(scene.model_dump(mode="json", by_alias=True))
@@ -189,7 +189,7 @@ def _forms(scene: Scene) -> dict[str, int]:
     effects = scene.effects
     rubs = bool(effects.obstacles) and any(entry.friction for entry in scene.obstacle or [])
     iterates = effects.finite_strain is not None or effects.frame is not None
-    return ({"friction": FRICTION} if rubs else {}) | ({"finite_strain": STRAIN} if iterates else {})
+    return ({"friction": FRICTION} if rubs else {}) | ({"iterations": ITERATIONS} if iterates else {})
 
 
 def _numbering(layout: BlockLayout) -> Array:

@@ -1,4 +1,4 @@
-"""Result of a run of the full model."""
+"""Results of runs of the full model: what all have in common, and that of a forward run."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from softgrasp.fem.columns import Columns
-from softgrasp.fem.labelled import FullOrderRun
+from softgrasp.fem.columns import Columns, labels
+from softgrasp.fem.labelled import Labelled, Quantity, of_columns, of_energy, of_hand
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
@@ -18,6 +18,60 @@ if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
     from softgrasp.fem.run.contact.record import ContactRecord
     from softgrasp.fem.strain.newton import NewtonFigures
+
+
+class FullOrderRun(Labelled):
+    """A run of the full model, forward or in a closed loop, whose outputs have columns."""
+
+    LOAD: ClassVar[str]
+    """Name of the field with the force on the hand in each step."""
+    outputs: Array
+    """Outputs, (steps + 1, p) [m, rad]."""
+    outputs_rigid: Array
+    """Outputs of tissue that moves rigidly with the hand, (steps + 1, p) [m, rad]."""
+    columns: Columns
+    """Name, axis and unit of each output component, p."""
+    q_s: Array
+    """Displacement of the hand, (steps + 1, n_s) [m, rad]."""
+    v_s: Array
+    """Velocity of the hand, (steps + 1, n_s) [m/s, rad/s]."""
+    energy: Array
+    """Energy of the deformation, (steps + 1,) [J]."""
+    dissipated: Array
+    """Energy dissipated by damping, (steps + 1,) [J]."""
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """Labels of the columns."""
+        return labels(self.columns)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Outputs, hand, its force and energies over time with their labels and units."""
+        names = self.output_names
+        return {
+            "outputs": of_columns(self.outputs, self.columns, "output"),
+            "outputs_rigid": of_columns(self.outputs_rigid, self.columns, "output"),
+            "q_s": of_hand(self.q_s, names),
+            "v_s": of_hand(self.v_s, names, rate="/s"),
+            self.LOAD: of_hand(getattr(self, self.LOAD), names, load=True),
+            "energy": of_energy(self.energy),
+            "dissipated": of_energy(self.dissipated),
+        }
+
+    def animate(self, model: Model) -> Any:
+        """The move on the mesh of its model, as an animated picture with ``save``. Collective.
+
+        Rank 0 has the picture. Raises SoftgraspError: the run kept no snapshots.
+        """
+        return drawn("animation", self, model)
+
+    def view3d(self, model: Model) -> Any:
+        """The move on the mesh of its model to turn, zoom and play in a notebook, with ``save`` as a page. Collective.
+
+        Rank 0 has the page. Obstacles are not drawn. Raises SoftgraspError: the run kept no snapshots.
+        """
+        return drawn("view3d", self, model)
 
 
 @dataclass(frozen=True, repr=False)
@@ -101,17 +155,3 @@ class Trajectory(Shown, FullOrderRun):
     def plot(self) -> Any:
         """Hand and outputs over time, and what outputs move relative to the hand, as ``matplotlib`` figure."""
         return drawn("trajectory", self)
-
-    def animate(self, model: Model) -> Any:
-        """The move on the mesh of its model, as an animated picture with ``save``. Collective.
-
-        Rank 0 has the picture. Raises SoftgraspError: the run kept no snapshots.
-        """
-        return drawn("animation", self, model)
-
-    def view3d(self, model: Model) -> Any:
-        """The move on the mesh of its model to turn, zoom and play in a notebook, with ``save`` as a page. Collective.
-
-        Rank 0 has the page. Obstacles are not drawn. Raises SoftgraspError: the run kept no snapshots.
-        """
-        return drawn("view3d", self, model)

@@ -13,13 +13,13 @@ from mpi4py import MPI
 
 from softgrasp.fem.columns import Columns, hand_of
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.labelled import FullOrderRun
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.ledger import Ledger
 from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.snapshots import Snapshots, make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
+from softgrasp.fem.run.trajectory import FullOrderRun
 from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
 from softgrasp.fem.solve.solvers import Reproducible, SolverUsed, choose_solver
 from softgrasp.lqr.loop.actuation import Actuation
@@ -120,20 +120,6 @@ class LoopTrajectory(Shown, FullOrderRun):
     def plot(self) -> Any:
         """Outputs and inputs over time, as ``matplotlib`` figure."""
         return drawn("loop", self)
-
-    def animate(self, model: Model) -> Any:
-        """The move on the mesh of its model, as an animated picture with ``save``. Collective.
-
-        Rank 0 has the picture. Raises SoftgraspError: the run kept no snapshots.
-        """
-        return drawn("animation", self, model)
-
-    def view3d(self, model: Model) -> Any:
-        """The move on the mesh of its model to turn, zoom and play in a notebook, with ``save`` as a page. Collective.
-
-        Rank 0 has the page. Obstacles are not drawn. Raises SoftgraspError: the run kept no snapshots.
-        """
-        return drawn("view3d", self, model)
 
 
 class ClosedLoop:

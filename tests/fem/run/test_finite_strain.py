@@ -143,15 +143,15 @@ def test_a_restart_file_of_another_iteration_is_refused(tmp_path: Path) -> None:
         with pytest.raises(Paused):
             simulate(model, RunOptions(tmp_path, until=3))
         entry = read_manifest(manifest, FORMAT)
-        assert ("finite_strain" in entry) is iterates
+        assert ("iterations" in entry) is iterates
     with pytest.raises(Paused):
         simulate(finite(), RunOptions(tmp_path, until=3))
     entry = read_manifest(manifest, FORMAT)
-    write_manifest(manifest, {**entry, "finite_strain": 1})
+    write_manifest(manifest, {**entry, "iterations": 1})
     with pytest.raises(CheckpointError) as error:
         simulate(finite(), RunOptions(tmp_path, resume=True))
     assert str(error.value) == (
-        f"{manifest} was written by another version of softgrasp, which continues finite strain in another form; run "
+        f"{manifest} was written by another version of softgrasp, which continues iterations in another form; run "
         "again without --resume"
     )
 
