@@ -50,35 +50,49 @@ def coarse_to_fine(places: Array) -> Order:
     ``places``: (nodes, d) [m].
     """
     count, extent = len(places), float(np.ptp(places, axis=0).max()) or 1.0
-    nodes, about, means = list[int](), list[NDArray[np.int64]](), list[Array]()
+    nodes, near = np.zeros(count, dtype=np.int64), np.full((count, NEAREST), -1)
     off = np.linalg.norm(places - places.mean(axis=0), axis=1)
-    for _ in range(count):
+    for i in range(count):
         node = int(np.argmax(np.round(off / extent, 9)))  # the first of equal ones
-        apart = np.linalg.norm(places[nodes] - places[node], axis=1)
-        near = np.array(nodes, dtype=np.int64)[np.argsort(np.round(apart / extent, 9), kind="stable")[:NEAREST]]
-        some, weights = _nearest_mean(places, node, near, BESIDE * extent)
-        about.append(some)
-        means.append(np.vstack([weights, np.eye(len(some))]) if nodes else np.zeros((0, 0)))
         apart = np.linalg.norm(places - places[node], axis=1)
-        off = np.minimum(off, apart) if nodes else apart
-        nodes.append(node)
-        off[nodes] = -1.0
-    return Order(np.array(nodes), tuple(about), tuple(means))
+        earlier = np.round(apart[nodes[:i]] / extent, 9)
+        some = np.arange(i)
+        if i > NEAREST:
+            some = np.flatnonzero(earlier <= np.partition(earlier, NEAREST - 1)[NEAREST - 1])
+        some = some[np.argsort(earlier[some], kind="stable")[:NEAREST]]
+        near[i, : len(some)] = nodes[some]
+        off = np.minimum(off, apart) if i else apart
+        nodes[i] = node
+        off[node] = -1.0
+    about = _nearest_means(places, nodes, near, BESIDE * extent)
+    means = (np.vstack([weights, np.eye(len(some))]) if len(some) else np.zeros((0, 0)) for some, weights in about)
+    return Order(nodes, tuple(some for some, _ in about), tuple(means))
 
 
-def _nearest_mean(places: Array, node: int, near: NDArray[np.int64], same: float) -> tuple[NDArray[np.int64], Array]:
-    """Of at most d nodes, the closest ones, those whose mean comes nearest to a node, and its weights."""
-    least, some, weights = np.inf, near[:1], np.ones(min(1, len(near)))
-    for size in range(1, min(places.shape[1], len(near)) + 1):
-        for chosen in combinations(range(len(near)), size):
-            corners = places[near[list(chosen)]]
-            edges, off = (corners[1:] - corners[0]).T, places[node] - corners[0]
-            inner = np.linalg.lstsq(edges, off, rcond=None)[0]
-            w = np.append(1 - inner.sum(), inner)
-            distance = max(float(np.linalg.norm(off - edges @ inner)), same)
-            if (w >= 0).all() and distance < (1 - 1e-6) * least:
-                least, some, weights = distance, near[list(chosen)], w
-    return some, weights
+def _nearest_means(
+    places: Array, nodes: NDArray[np.int64], near: NDArray[np.int64], same: float
+) -> list[tuple[NDArray[np.int64], Array]]:
+    """Of every node at most d of those near to it, the closest ones, whose mean comes nearest, and its weights.
+
+    ``near``: numbers of nodes, closest ones first, -1 behind the last one, (nodes, NEAREST).
+    """
+    count, d = places.shape
+    least = np.full(count, np.inf)
+    best, weights = np.full((count, d), -1), np.zeros((count, d))
+    best[:, 0], weights[:, 0] = near[:, 0], 1.0
+    for size in range(1, d + 1):
+        for chosen in combinations(range(NEAREST), size):
+            here = np.flatnonzero(near[:, chosen[-1]] >= 0)
+            corners = places[near[here][:, chosen]]
+            edges, off = (corners[:, 1:] - corners[:, :1]).swapaxes(1, 2), places[nodes[here]] - corners[:, 0]
+            inner = np.einsum("ned,nd->ne", np.linalg.pinv(edges), off)  # edges in a line have the least weights
+            w = np.column_stack([1 - inner.sum(axis=1), inner])
+            distance = np.maximum(np.linalg.norm(off - np.einsum("nde,ne->nd", edges, inner), axis=1), same)
+            better = (w >= 0).all(axis=1) & (distance < (1 - 1e-6) * least[here])
+            at = here[better]
+            least[at], best[at], weights[at] = distance[better], -1, 0.0
+            best[at, :size], weights[at, :size] = near[at][:, chosen], w[better]
+    return [(some[some >= 0], w[some >= 0]) for some, w in zip(best, weights, strict=True)]
 
 
 def thinned(order: Order, v: Array, seen: Array, reach: Array, whole: Array, most: Array) -> Thinned:
