@@ -19,6 +19,7 @@ from softgrasp.lqr.loop.controller import Controller, layout_hash
 from softgrasp.lqr.observer.full import FullFilter, full_filter
 from softgrasp.lqr.observer.judge import Judged, Ticks, abscissa_without, judge, make_ticks, slowest_mode
 from softgrasp.lqr.observer.reduced import ReducedFilter, reduced_filter
+from softgrasp.lqr.observer.seen import Seen, seen_modes
 from softgrasp.lqr.observer.sensors import Noise, Sensors, make_disturbance, make_sensors
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem
@@ -46,6 +47,8 @@ class ObservedControl:
     """Full plant, filter and gain."""
     without: dict[str, float]
     """Abscissa of the whole loop where a marker, or all samples but those of the hand, never arrive [1/s]."""
+    seen: Seen | None
+    """Modes of the filter as the markers see them; None without markers."""
     full: FullFilter | None
     """Kalman filter of the full tissue from the markers; None without markers, or where it was not found."""
     missing: str
@@ -125,9 +128,11 @@ def observe(design: Design, watch: Stopwatch) -> ObservedControl:
             found = _with_other_modes(problem, found, candidate, ticks)
         controller = found.controller
         without = on_root(problem.layout.comm, lambda: _without(ticks, controller, sensors))
+        seen = seen_modes(problem, loop.plant, sensors, found.reduced.kept, period) if given.markers else None
     return ObservedControl(
-        controller, sensors, found.reduced, found.weight, found.judged, without, full, missing, sd_full, loop, ticks
-    )
+        controller, sensors, found.reduced, found.weight, found.judged, without, seen, full, missing, sd_full, loop,
+        ticks,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

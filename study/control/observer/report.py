@@ -7,10 +7,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from softgrasp.fem.shown import counted, percent
+from softgrasp.lqr.observer.seen import STILL, Seen
 from softgrasp.study.control.observer.result import ObservedStudy
 from softgrasp.study.report.document import Section, in_words
 
 SAMPLES = ("sample", "standard deviation", "with what the filter leaves out")
+MODES = ("mode", "frequency [Hz]", "largest motion of a marker [%]", "hidden by the noise below [mm]")
+SEEN = (
+    f"A marker sees a mode where it moves by {percent(STILL)} of the node that moves most, or more. Free swings of "
+    "that node below the last column are hidden by the noise of all markers together."
+)
 OUTPUTS = ("output", "estimate [m, rad]", "by the full filter [m, rad]", "from the target [m, rad]")
 
 
@@ -27,11 +33,28 @@ def observer_sections(study: ObservedStudy) -> list[Section]:
         "Standard deviations under the disturbances of the scene, for ever: of the estimate in the loop, of the best "
         "estimate from the markers alone of a tissue whose hand is known, and of the output from its target."
     )
+    seen = [] if found.seen is None else [modes_section(found.seen)]
     return [
         Section("Observer", sentence(study), rows=list(facts(study)), terminal=True),
+        *seen,
         Section("Outputs under disturbances", text, header=OUTPUTS, rows=outputs),
         Section("Samples", "Standard deviation of one sample.", header=SAMPLES, rows=samples),
     ]
+
+
+def modes_section(seen: Seen) -> Section:
+    """Which modes of the filter the markers see."""
+    words: list[str] = []
+    rows: list[tuple[int, float, float, float | None]] = []
+    for i, mode in enumerate(seen.modes.tolist()):
+        blind, hidden = seen.blind(i), float(seen.hidden[i])
+        by = "any marker" if len(blind) == len(seen.names) else in_words(blind)
+        if blind:
+            words.append(f"Mode {mode + 1} ({seen.frequency[i]:.3g} Hz) is not seen by {by}.")
+        share = 100 * float(seen.share[:, i].max())
+        rows.append((mode + 1, float(seen.frequency[i]), share, 1e3 * hidden if np.isfinite(hidden) else None))
+    text = " ".join(words) or "Every marker sees every mode of the filter along every axis."
+    return Section("Modes that the markers see", f"{text} {SEEN}", header=MODES, rows=rows, terminal=bool(words))
 
 
 def sentence(study: ObservedStudy) -> str:

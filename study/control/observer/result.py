@@ -9,6 +9,7 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.observer import ObservedControl
+from softgrasp.lqr.observer.seen import Seen
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,8 @@ class ObservedStudy:
     def result(self) -> dict[str, Any]:
         """The key "observer" of ``result.json``."""
         found, judged, own = self.observed, self.observed.judged, self.observed.reduced
-        full = found.full
+        full, seen = found.full, found.seen
+        modes = [] if seen is None else [seen_mode(seen, i) for i in range(len(seen.modes))]
         return {
             "N": own.plant.N,
             "samples": list(found.sensors.names),
@@ -31,6 +33,7 @@ class ObservedStudy:
             "sd_samples": found.sensors.sd.tolist(),
             "sd_left_out": np.sqrt(own.left_out).tolist(),
             "weight_left_out": found.weight,
+            "modes": modes,
             "delay": own.filter.delay,
             "period": found.controller.period,
             "abscissa": judged.abscissa,
@@ -48,3 +51,15 @@ class ObservedStudy:
             "solves": None if full is None else full.solution.counts["solves"],
             "time_tick": self.tick,
         }
+
+
+def seen_mode(seen: Seen, i: int) -> dict[str, Any]:
+    """One mode of the filter: number from 1, share of its largest motion that every marker makes, what hides it."""
+    hidden = float(seen.hidden[i])
+    return {
+        "mode": int(seen.modes[i]) + 1,
+        "frequency": float(seen.frequency[i]),
+        "share": dict(zip(seen.names, seen.share[:, i].tolist(), strict=True)),
+        "not_seen_by": seen.blind(i),
+        "hidden": hidden if np.isfinite(hidden) else None,
+    }

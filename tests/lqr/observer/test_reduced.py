@@ -13,7 +13,7 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import Stopwatch, build
-from softgrasp.fem.petsc import total
+from softgrasp.fem.petsc import rows_on_all, total
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.design.feedback import Design, design
 from softgrasp.lqr.design.observer import ObservedControl, observe
@@ -73,6 +73,24 @@ def test_filter_that_ignores_what_it_leaves_out_spills_over() -> None:
     fast = np.log(np.abs(np.linalg.eigvals(own.A @ (np.eye(14) - own.M @ own.C))).max()) / 1e-3
     assert fast < -1  # on its own plant nothing shows
     assert -0.1 < slow < 0  # the full one is a tenth as fast as with the state known
+
+
+def test_swings_that_the_noise_hides_add_up_to_it() -> None:
+    """Samples of the full plant from a free swing: the sum of all, over their variances, is one."""
+    made, found, ticks = observed()
+    seen, n, modes = found.seen, len(found.loop.plant.omega), found.loop.plant
+    assert seen is not None
+    for i, mode in enumerate(seen.modes):
+        pair = [4 + mode, 4 + n + mode]
+        C = ticks.C[found.sensors.markers][:, pair] / ticks.sd[found.sensors.markers, None]
+        A = ticks.A[np.ix_(pair, pair)]
+        gramian = scipy.linalg.solve_discrete_lyapunov(A.T, C.T @ C)
+        shape = rows_on_all(made.problem.layout.comm, modes.Phi[:, mode])
+        moved = np.linalg.norm(shape.reshape(-1, 2), axis=1).max()
+        eta = seen.hidden[i] / moved
+        # samples of 1 ms for an integral, and a decay of 1.4 % of the third mode's frequency
+        assert abs(gramian[0, 0] * (modes.omega[mode] * eta) ** 2 - 1) < 0.02
+        assert (seen.share[:, i] <= 1).all()
 
 
 def test_correction_solves_the_riccati_equation_of_the_ticks() -> None:

@@ -14,7 +14,10 @@ from rich.console import Console
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.lqr.loop.controller import Controller
+from softgrasp.lqr.observer.seen import Seen
 from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.study.control.observer.report import modes_section
+from softgrasp.study.control.observer.result import seen_mode
 from softgrasp.study.control.run import run_control
 
 SMALL = ["tissue.cells=[4,8]", "control.N=[8]", "output.fields='none'", "output.frames=2"]
@@ -46,7 +49,22 @@ def test_page_file_and_numbers_agree(tmp_path: Path) -> None:
     assert own.delay == 2
     assert list(own.names) == found["samples"]
     assert Controller.load(tmp_path / "controller.npz").observer is None
+    assert [mode["mode"] for mode in found["modes"]] == [1, 2, 3]
+    assert list(found["modes"][0]["share"]) == found["samples"][2:]
+    assert "Modes that the markers see" in (tmp_path / "report.html").read_text()
     assert "Standard deviation of one sample" in (tmp_path / "report.html").read_text()
+
+
+def test_modes_that_a_marker_does_not_see_are_named() -> None:
+    share = np.array([[0.94, 0.005, 0.0], [0.007, 0.96, 0.009]])
+    seen = Seen(
+        np.array([0, 1, 4]), np.array([0.688, 1.61, 2.2]), share, np.array([9e-6, 2e-5, np.inf]), ("a_x", "a_y")
+    )
+    section = modes_section(seen)
+    assert section.text.startswith("Mode 1 (0.688 Hz) is not seen by a_y. Mode 2 (1.61 Hz) is not seen by a_x. ")
+    assert "Mode 5 (2.2 Hz) is not seen by any marker." in section.text
+    assert section.rows[2][3] is None
+    assert seen_mode(seen, 2)["hidden"] is None  # JSON has no infinity
 
 
 @pytest.mark.parametrize(
