@@ -59,9 +59,8 @@ def hand_target(problem: RiccatiProblem, q_bar: Array) -> Target:
     layout = problem.layout
     given = np.asarray(q_bar, dtype=np.float64).ravel()
     if len(given) not in (layout.dimension, layout.n_s) or not np.isfinite(given).all():
-        raise ControlError(
-            f"the target {given.tolist()} of the hand must have {layout.dimension} or {layout.n_s} finite entries"
-        )
+        counts = " or ".join(dict.fromkeys((str(layout.dimension), str(layout.n_s))))
+        raise ControlError(f"the target {given.tolist()} of the hand must have {counts} finite entries")
     q = np.zeros(layout.n_s)
     q[: len(given)] = given
     return _at(problem, q, equilibrium(problem.system))
