@@ -35,6 +35,7 @@ ORDER = (
     "ranks",
 )  # of the gallery
 OWN_BASIS = "static_responses.py"
+SHORT = 12  # letters of a cell that stays in one line
 ROOMS = {"fem": "Scene, model, run", "reduction": "Reduced models", "lqr": "Control", "study": "Many runs"}
 MORE = {
     "study": ["study.runs.sweep.SweepTable", "study.notebook.Film"],
@@ -85,6 +86,18 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
         return f"]({os.path.relpath(ROOT / 'docs' / made[target], folder)}" if target in made else found[0]
 
     return re.sub(r"\]\(([^)#:]+)", link, markdown)
+
+
+def on_page_content(html: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """No line ends inside 5.5e-13 or --set in a table."""
+
+    def cell(found: re.Match[str]) -> str:
+        start, inside, end = found.groups()
+        short = len(re.sub(r"<[^>]*>", "", inside)) <= SHORT
+        whole = r'<span class="whole">\g<0></span>'
+        return start + re.sub(r"(?s)^.+$" if short else r"(?<=[ >])--?[a-z][\w-]*", whole, inside) + end
+
+    return re.sub(r"(?s)(<td[^>]*>)(.*?)(</td>)", cell, html)
 
 
 def python_names() -> str:
