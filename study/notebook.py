@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import scipy.linalg
 
-from softgrasp.fem import Array, Model, OutputColumn, PictureMesh, ReducedSystem, SoftgraspError, Trajectory
+from softgrasp.fem import Array, Model, OutputColumn, PictureMesh, ReducedSystem, SoftgraspError, Trajectory, percent
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
 from softgrasp.fem.labelled import package
 from softgrasp.lqr import LoopMargins, LoopTrajectory
@@ -32,6 +32,7 @@ from softgrasp.study.pictures.turning import Scene3D
 from softgrasp.study.reduce.linear.plots import QUANTITIES, errors_figure
 from softgrasp.study.reduce.linear.result import MethodSweep
 
+FREE = 1e-4  # of the slowest pole of the tissue: a slower one of the hand is its free motion, a zero but for rounding
 FREQUENCIES = 800  # of a Bode diagram, even in log w
 
 
@@ -68,8 +69,10 @@ def _space(run: Trajectory | LoopTrajectory) -> int:
 
 def system_bode(system: ReducedSystem) -> Any:
     """Gain |C (i w E - A)^-1 B| and phase from each input to each output. Not collective."""
-    sizes = np.abs(scipy.linalg.eigvals(system.A, system.E))
-    sizes = sizes[np.isfinite(sizes) & (sizes > 1e-8 * sizes.max())]  # without the free hand
+    sizes = np.sort(np.abs(scipy.linalg.eigvals(system.A, system.E)))
+    sizes = sizes[np.isfinite(sizes)]
+    free, rest = sizes[: 2 * system.n_s], sizes[2 * system.n_s :]
+    sizes = np.append(free[free > FREE * rest.min(initial=np.inf)], rest) if len(rest) else free
     omega = np.geomspace(0.1 * sizes.min(), 10 * sizes.max(), FREQUENCIES)
     H = system.transfer(1j * omega)
     with paper_style():
@@ -106,7 +109,7 @@ def model_errors(rom: ReducedModel, model: Model, run: Trajectory) -> Any:
         log_axis(below, None)
         top.set_ylabel(f"relative to hand [{unit}]")
         below.set(xlabel="time [s]", ylabel="error over largest output [1]")
-        top.set_title(f"{rom.name}: error of the deformation {100 * error:.2g} %")
+        top.set_title(f"{rom.name}: {percent(error)} of the deformation and its rate, over the whole body")
         top.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return _free(figure)
 

@@ -14,6 +14,7 @@ from PIL import Image
 
 import softgrasp as sg
 from softgrasp.fem.errors import SceneError, SoftgraspError
+from softgrasp.fem.reduced import ReducedSystem
 from softgrasp.fem.shown import Shown, percent
 from softgrasp.lqr.loop.full import LoopOptions
 from softgrasp.lqr.loop.margins import loop_margins
@@ -114,6 +115,13 @@ def test_figures_show_what_the_objects_hold(objects: dict[str, Any], tmp_path: P
     E, A, B, C = (getattr(objects["system"], name) for name in "EABC")
     exact = abs(C @ np.linalg.solve(1j * omega * E - A, B))[0, 0]
     assert gain.get_ydata()[100] == pytest.approx(exact, rel=1e-9)  # two orders of the same sums
+    # of a free hand rounding leaves the poles +-1e-4i, where only +-4i of the tissue is to see
+    turn, zero = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.zeros((2, 2))
+    free = ReducedSystem(
+        np.eye(4), np.block([[1e-4 * turn, zero], [zero, 4 * turn]]), np.ones((4, 1)), np.ones((1, 4)), np.zeros(4),
+        np.zeros((1, 4)), np.zeros((1, 4)),
+    )  # fmt: skip
+    assert free.bode().axes[0].lines[0].get_xdata()[0] == pytest.approx(0.4)  # a decade below the pole
     _, error = rom.plot_errors(objects["model"], run).axes
     change = objects["replay"].outputs - run.outputs
     scale = np.linalg.norm(run.outputs - run.outputs_rigid, axis=1).max()

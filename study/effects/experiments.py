@@ -16,6 +16,7 @@ from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.study.effects.result import Change, Elements
 from softgrasp.study.effects.switch import Scales, switch
 from softgrasp.study.forward.cautions import LOCKING
+from softgrasp.study.report import percent
 
 Names = frozenset[str]
 
@@ -169,8 +170,9 @@ def check_elements(
     change = compare(displacements(model, trajectory), displacements(other, simulate(other, RunOptions())))
     needed = change.outputs > tolerance
     text = (
-        f"Measured at nu = {nu:.4g}: on the same mesh tissue.order = 2 changes the outputs by {change.outputs:.2g} and "
-        f"their deformation by {change.deformation:.2g}, tolerance {tolerance:g}: "
+        f"Measured at nu = {nu:.4g}: on the same mesh tissue.order = 2 changes the outputs by "
+        f"{percent(change.outputs)} and their deformation by {percent(change.deformation)}, "
+        f"tolerance {percent(tolerance)}: "
     )
     text += "P2 is needed." if needed else "this run does not show the locking."
     ratio = other.system.layout.n_e / model.system.layout.n_e

@@ -249,11 +249,15 @@ def ends(samples: Array, share: float = 0.0) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def cost_of(with_: MeasuredScene, without: MeasuredScene, noise: float) -> Cost:
-    """The differences of two cases; ``noise`` is what a step of one scene differs from itself by."""
-    assembly, setup, step = (
-        np.array(with_.seconds[stage]) - np.array(without.seconds[stage]) for stage in ("assembly", "setup", "step")
-    )
+def gaps(a: MeasuredScene, b: MeasuredScene, stage: str) -> Array:
+    """Paired differences of the samples of a stage [s]."""
+    difference: Array = np.array(a.seconds[stage]) - np.array(b.seconds[stage])
+    return difference
+
+
+def cost_of(with_: MeasuredScene, without: MeasuredScene, noise: dict[str, float]) -> Cost:
+    """The differences of two cases; ``noise``: what the scene differs from itself by, the step as a share."""
+    assembly, setup, step = (gaps(with_, without, stage) for stage in ("assembly", "setup", "step"))
     shares = step / np.array(without.seconds["step"])
     more, less = sum(with_.bytes.values()), sum(without.bytes.values())
     return Cost(
@@ -261,11 +265,13 @@ def cost_of(with_: MeasuredScene, without: MeasuredScene, noise: float) -> Cost:
         setup=float(np.median(setup)),
         assembly_range=ends(assembly),
         setup_range=ends(setup),
+        assembly_noise=noise["assembly"],
+        setup_noise=noise["setup"],
         step=float(np.median(step)),
         step_relative=float(np.median(shares)),
         step_low=float(shares.min()),
         step_high=float(shares.max()),
-        step_noise=noise,
+        step_noise=noise["step"],
         step_quartiles=ends(shares, 0.25),
         flops=with_.flops - without.flops,
         flops_relative=with_.flops / without.flops - 1 if without.flops else 0.0,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,11 @@ from typing import Any
 import matplotlib.pyplot as plt
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import NullFormatter
 
-from softgrasp.fem import Scene
+from softgrasp.fem import Scene, size_text
 from softgrasp.study.effects.result import EffectResult, EffectsStudy
+from softgrasp.study.forward.explain_page import error_lines
 from softgrasp.study.pictures import BLUE, GREEN, HAND, ORANGE, OUTLINE, WIDTH, paper_style, save
 from softgrasp.study.report import Columns, Page, Section, Table, in_words, percent, table_of
 from softgrasp.study.shell import Session
@@ -30,7 +32,7 @@ HOW = (
     ("beside advised", "the change when this effect alone is switched and all others are as advised"),
     ("optional", "the effect changes the outputs by less, but it costs nothing or the control problem needs it"),
     ("wasted", "the effect costs work or memory and changes no output"),
-    ("noise", "paired samples disagree, or differ by less than two steps of the same scene do"),
+    ("noise", "paired samples disagree, or differ by no more than the scene does from itself"),
     ("costs", "counted operations and allocated memory decide; times are shown with their noise"),
     ("factor", "the time to factor S and to solve for the hand's equation before the first step"),
 )
@@ -56,11 +58,11 @@ NOTE = (
 )
 COSTS: Columns = {
     "effect adds": "name",
-    "assembly": lambda f: _seconds(f.cost.assembly, f.cost.assembly_range),
-    "factor": lambda f: _seconds(f.cost.setup, f.cost.setup_range),
-    "step": lambda f: _more(1e6 * f.cost.step, ".2f", " us", f.cost.step_relative) if f.cost.step_shows else "noise",
-    "operations": lambda f: _more(f.cost.flops, ".0f", "", f.cost.flops_relative),
-    "memory": lambda f: _more(f.cost.memory / 1024, ".1f", " KiB", f.cost.memory_relative),
+    "assembly": lambda f: _seconds(f.cost.assembly, f.cost.assembly_range, f.cost.assembly_noise),
+    "factor": lambda f: _seconds(f.cost.setup, f.cost.setup_range, f.cost.setup_noise),
+    "a step": lambda f: _more(f.cost.step, _time, f.cost.step_relative) if f.cost.step_shows else "noise",
+    "its operations": lambda f: percent(f.cost.flops_relative, "+") if f.cost.flops else "none",
+    "memory": lambda f: _more(f.cost.memory, size_text, f.cost.memory_relative),
     "PETSc objects": lambda f: ", ".join(f"{n:+d} {kind.lower()}" for kind, n in f.cost.objects.items()) or "none",
 }
 CSV: Columns = {
@@ -83,7 +85,7 @@ def compose(study: EffectsStudy, scene: Scene, session: Session) -> Page:
     sections = [Section("", figures=[(files[0], CAPTION)]), *parts(study)]
     return Page(
         f"{scene.name}: effects", summary(study), sections, {"effects.csv": table_of(study.findings, CSV)}, files,
-        warnings=study.warnings,
+        errors=error_lines(study.explanation.mesh, scene.effects.frame is not None), warnings=study.warnings,
     )  # fmt: skip
 
 
@@ -94,15 +96,16 @@ def parts(study: EffectsStudy) -> list[Section]:
     ]
     advice.append(("all together", joint_changes(study)))
     base = study.base
-    times = [f"{1e3 * base['assembly']:.2f} ms", f"{1e3 * base['setup']:.2f} ms", f"{1e6 * base['step']:.2f} us"]
-    scene = ("the scene", *times, f"{base['flops']:.0f}", f"{base['memory'] / 1024:.0f} KiB", "")
+    times = [_time(base[stage]) for stage in ("assembly", "setup", "step")]
+    scene = ("the scene", *times, _count(base["flops"]), size_text(base["memory"]), "")
     proofs = [
         (f.name, *("same" if same else "NOT the same" for same in astuple(f.proof))) for f in study.off if f.proof
     ]
     free = Table(("off", *PROOFS), proofs, "Effects that are off cost nothing")
     low, high = study.noise
     how = (
-        ("tolerance", f"{study.tolerance:g}: relative change of the outputs that counts"), *HOW,
+        ("tolerance", f"{percent(study.tolerance)} of their largest displacement, by study.tolerance: a larger change "
+         "of the outputs counts"), *HOW,
         ("samples", f"{study.repeats} of the steps, {study.builds} of the builds, interleaved; medians of pairs"),
         *PROOFS.items(),
     )  # fmt: skip
@@ -147,14 +150,28 @@ def joint_changes(study: EffectsStudy) -> str:
     return f"With {in_words(study.beside)} on, switching one effect alone changes the outputs by: {', '.join(parts)}."
 
 
-def _more(value: float, form: str, unit: str, share: float) -> str:
+def _more(value: float, text: Callable[[float], str], share: float) -> str:
     """A cost beside the share by which it is larger."""
-    return f"{value:+{form}}{unit} ({percent(share, '+')})"
+    return f"{_signed(value, text)} ({percent(share, '+')})" if value else "none"
 
 
-def _seconds(median: float, spread: tuple[float, float]) -> str:
-    """Added time; noise when the paired samples do not agree in sign."""
-    return "noise" if spread[0] <= 0 <= spread[1] else f"{1e3 * median:+.2f} ms"
+def _seconds(median: float, spread: tuple[float, float], noise: float) -> str:
+    """Added time; noise when the paired samples do not agree in sign, or the scene differs from itself by as much."""
+    return "noise" if spread[0] <= 0 <= spread[1] or abs(median) <= noise else _signed(median, _time)
+
+
+def _signed(value: float, text: Callable[[float], str]) -> str:
+    return f"{'-' if value < 0 else '+'}{text(abs(value))}"
+
+
+def _time(seconds: float) -> str:
+    unit, factor = ("ms", 1e3) if seconds > 0.9995e-3 else ("us", 1e6)
+    return f"{factor * seconds:.{3 if factor * seconds < 999.5 else 4}g} {unit}"
+
+
+def _count(operations: float) -> str:
+    unit, factor = ("million", 1e-6) if operations > 0.9995e6 else ("thousand", 1e-3)
+    return f"{factor * operations:.3g} {unit}"
 
 
 # --- change against cost, in one picture
@@ -184,13 +201,15 @@ def figure_effects(
             }
             _draw_changes(changes, row, f, look)
             _draw_costs(costs, row, f, look)
-        changes.set(xscale="log", xlabel="relative change of the outputs")
+        changes.set(xscale="log", xlabel="change of the outputs")
+        changes.xaxis.set_major_formatter(lambda x, _: percent(x))
+        changes.xaxis.set_minor_formatter(NullFormatter())
         changes.axvline(tolerance, color=HAND, lw=0.9, ls=(0, (4, 3)), zorder=1)
         costs.axvline(0.0, color=HAND, lw=0.7, zorder=1)
         costs.axvspan(100 * min(noise[0], 0.0), 100 * max(noise[1], 0.0), color=BAND, lw=0, zorder=0)
         costs.set_xscale("symlog", linthresh=10.0)
-        costs.set_xlabel("added cost [%]")
-        costs.xaxis.set_major_formatter("{x:g}")
+        costs.set_xlabel("added cost")
+        costs.xaxis.set_major_formatter("{x:g} %")
         for ax in (changes, costs):
             ax.tick_params(axis="y", length=0)
             ax.grid(axis="y", color="#eeeeee", lw=0.8)
@@ -199,7 +218,7 @@ def figure_effects(
         entries: list[Any] = [_grey(text, marker) for marker, text in marks.items() if marker in drawn]
         entries += [
             _grey("off, tried", "o", mfc="white"),
-            Line2D([], [], color=HAND, ls="--", label=f"tolerance {tolerance:g}"),
+            Line2D([], [], color=HAND, ls="--", label=f"tolerance {percent(tolerance)}"),
         ]
         entries += [_grey("time of a step", "h"), _grey("memory", "s"), Patch(color=BAND, label="noise of the time")]
         figure.legend(handles=entries, loc="outside lower center", ncols=5)

@@ -46,6 +46,8 @@ class Cost:
     setup: float  # seconds of the factor and the solves before the first step
     assembly_range: tuple[float, float]  # least and largest paired sample [s]
     setup_range: tuple[float, float]  # least and largest paired sample [s]
+    assembly_noise: float  # by which the assembly of the scene differs from itself [s]
+    setup_noise: float  # by which the factor and the first solves of the scene differ from themselves [s]
     step: float  # seconds of a step
     step_relative: float  # share of the step time [1]
     step_low: float  # least paired share of the step time [1]

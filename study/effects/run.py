@@ -22,6 +22,7 @@ from softgrasp.study.effects.measure import (
     MeasuredScene,
     bare_output,
     ends,
+    gaps,
     measure_builds,
     measure_steps,
     objects_of,
@@ -32,6 +33,7 @@ from softgrasp.study.effects.switch import Scales, switches
 from softgrasp.study.effects.together import Changes, advised
 from softgrasp.study.effects.verdict import assess, shows
 from softgrasp.study.forward.explain import Explanation, explain_model, fewer_cells
+from softgrasp.study.report import percent
 from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.shell import Session, folder_lock
 
@@ -95,7 +97,8 @@ def study_effects(
         case.objects, case.objects_in_steps = objects_of(comm, scenes[name], mesh)
     base, again = cases[SCENE], cases[AGAIN]
     ratio = np.array(again.seconds["step"]) / np.array(base.seconds["step"]) - 1
-    noise = max(TIMER, float(np.abs(ratio).max()))
+    noise = {stage: float(np.abs(gaps(again, base, stage)).max()) for stage in ("assembly", "setup")}
+    noise["step"] = max(TIMER, float(np.abs(ratio).max()))
     return EffectsStudy(
         findings=tuple(assess(s, explanation, cases, changes, together, noise) for s in effects),
         advised=together.on,
@@ -171,7 +174,7 @@ def run_effects(
     """
     session = Session("effects", path, overrides, out, console, quiet, empty=empty)
     comm, scene = session.comm, session.scene()
-    console.print(f"effects at the tolerance {scene.study.tolerance:g}")
+    console.print(f"effects count where they change the outputs by more than {percent(scene.study.tolerance)}")
     with session.progress(MofNCompleteColumn()) as bar:
         task = bar.add_task("runs", total=None)
         study = study_effects(scene, comm, lambda done, work: bar.update(task, completed=done, total=work))

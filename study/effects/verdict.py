@@ -28,7 +28,7 @@ def assess(
     cases: dict[str, MeasuredScene],
     changes: Changes,
     together: JointAdvice,
-    noise: float,
+    noise: dict[str, float],
 ) -> EffectResult:
     """Judge one effect and say what to do about it. Collective."""
     scene = cases[SCENE].model.scene

@@ -15,7 +15,7 @@ import numpy as np
 from cycler import cycler
 from PIL import Image
 
-from softgrasp.fem import note
+from softgrasp.fem import note, percent
 from softgrasp.study.pictures.pdf import PDF
 
 if "inline" not in os.environ.get("MPLBACKEND", ""):  # a notebook shows figures by its own
@@ -71,6 +71,12 @@ def few_ticks(axis: Any) -> None:
     if few and low >= 1e-3 and high < 1e5:
         axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def percent_ticks(axis: Any) -> None:
+    """Few numbers on a logarithmic axis of shares, as percentages."""
+    few_ticks(axis)
+    axis.set_major_formatter(FuncFormatter(lambda x, _: percent(x)))
 
 
 def log_axis(ax: Any, top: float | None) -> None:

@@ -92,7 +92,11 @@ def _angles(ax: Any, times: Array, q_s: Array, d: int) -> None:
     turned = np.abs(q_s[:, d:]).max(axis=0) > 0
     for j, column in enumerate(hand_columns(q_s.shape[1], d)[d:]):
         if turned[j] or not turned.any():
-            ax.plot(times, q_s[:, d + j], color=CYCLE["xyz".index(column.axis[-1])], label=f"hand, {column.axis}")
+            look: dict[str, Any] = {
+                "color": CYCLE["xyz".index(column.axis[-1])],
+                "ls": ("-", (0, (4, 3)), (0, (1, 2)))[j],
+            }
+            ax.plot(times, q_s[:, d + j], label=f"hand, {column.axis}", **look)
     ax.set_ylabel("hand angle [rad]")
     ax.legend(loc="best", handlelength=2.0)
 

@@ -159,9 +159,9 @@ class Answers:
         closest = None
         if full is not None:
             words.append(
-                f"The cheapest full run within {tolerance:g} is {full.point.label}: {_prediction(full)}, measured "
-                f"{percent(full.point.error)} of the deformation ({percent(full.point.error_displacement)} of the "
-                "displacement) "
+                f"The cheapest full run within {percent(tolerance)} is {full.point.label}: {_prediction(full)}, "
+                f"measured {percent(full.point.error)} of the deformation ({percent(full.point.error_displacement)} of "
+                "the displacement) "
                 f"in {seconds_text(full.point.seconds)}."
             )
         if reduced is not None and isinstance(reduced.point, ReducedPoint):
@@ -188,8 +188,8 @@ class Answers:
         every: list[RunPoint] = [*usable(self.forward), *usable(self.reduced), *usable(self.measured)]
         best = min(every, key=lambda p: p.error)
         words = [
-            f"Nothing tried meets {tolerance:g}; closest is {best.label} with an error of {percent(best.error)}, "
-            f"known to within {percent(self.truth.error)}, in {seconds_text(best.seconds)}."
+            f"Nothing tried meets {percent(tolerance)}; closest is {best.label} with an error of "
+            f"{percent(best.error)}, known to within {percent(self.truth.error)}, in {seconds_text(best.seconds)}."
         ]
         words.append(advice(self.shares(best)))
         large = self.too_large(tolerance)

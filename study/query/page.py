@@ -37,7 +37,11 @@ def compose(answers: QueryResult, session: Session, options: str) -> Page:
         parts += [output_table(first).section()] if shown else []
     about = [("modes of the answer, of the proof", f"{model.k}, {model.k2}")]
     about += [("trained for", box_text(model.box))] if model.box is not None else []
-    about += [("built for an error of", f"{model.tolerance:g}")] if model.tolerance is not None else []
+    about += (
+        [("built for an error of", f"{percent(model.tolerance)} of the {NORMS[model.norm]}")]
+        if model.tolerance is not None
+        else []
+    )
     tables = {("answers.csv" if many else "answer.csv"): answers.table()} if shown else {}
     error, *summary = _summary_batch(answers) if many else _summary(first, answers.seconds)
     return Page(
@@ -95,7 +99,9 @@ def _summary(answer: CertifiedAnswer, seconds: float) -> list[str]:
         return [error, f"{at} the certified model refuses to answer."]
     ends = in_words([f"{name} at {end:.4g} m" for name, end, *_ in answer.outputs()])
     took = "" if answer.full else f", in {1e3 * seconds:.3g} ms with its error"
-    within = [] if answer.warnings or c.tolerance is None else [f"This is within the tolerance {c.tolerance:g}."]
+    within = (
+        [] if answer.warnings or c.tolerance is None else [f"This is within the tolerance of {percent(c.tolerance)}."]
+    )
     return [error, f"{at} the {answer.source} ends with {ends}{took}.", *within]
 
 

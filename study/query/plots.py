@@ -8,9 +8,11 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
+from matplotlib.lines import Line2D
 
 from softgrasp.study.pictures import few_ticks, length_unit, paper_style, save, style
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
+from softgrasp.study.report import percent
 
 LEAST = 1e-16  # of an error that is drawn
 
@@ -36,15 +38,17 @@ def figure_answer(answer: CertifiedAnswer, out: Path) -> tuple[Path, ...]:
                 band = factor * (y[:, i] - bound), factor * (y[:, i] + bound)
                 top.fill_between(run.times, *band, color=colour, alpha=0.25, lw=0)
                 top.plot(run.times, factor * y[:, i], color=colour, label=name)
-                below.semilogy(run.times[1:], np.maximum(bound[1:], LEAST), color=colour, label=c.how)
+                below.semilogy(run.times[1:], np.maximum(bound[1:], LEAST), color=colour)
                 if c.proved and c.outputs_estimate is not None:
                     about = np.maximum(np.maximum.accumulate(c.outputs_estimate.values[1:, i]), LEAST)
-                    below.semilogy(run.times[1:], about, color=colour, ls=":", label="estimated")
+                    below.semilogy(run.times[1:], about, color=colour, ls=":")
             top.set_ylabel(f"relative to hand [{unit}]")
-            figure.legend(*top.get_legend_handles_labels(), loc="outside upper left", ncols=3)
+            kinds = [Line2D([], [], color=style.HAND, ls=":", label="estimated")] if c.proved else []
+            kinds = [Line2D([], [], color=style.HAND, label=c.how), *kinds]
+            entries = [*top.get_legend_handles_labels()[0], *kinds]
+            figure.legend(handles=entries, loc="outside upper left", ncols=min(4, len(entries)), columnspacing=1.2)
             largest = float(c.outputs.values.max(initial=LEAST))
             below.set(xlabel="time [s]", ylabel="largest error so far [m]", ylim=(1e-4 * largest, 2 * largest))
-            below.legend(handles=below.lines[:2], loc="lower right")
         _three(axes[-1, 0], answer)
         return save(figure, out / ("answer.png" if rows == 3 else "errors.png"))
 
@@ -63,10 +67,10 @@ def _three(ax: Any, answer: CertifiedAnswer) -> None:
             ax.barh(i, value - low, left=low, color=colour if proof else "none", ec=colour, height=0.6)
     ax.set_yticks(range(3), [name if value is not None else f"{name}: not known" for name, value in errors])
     ax.set(xscale="log", xlim=(low, 3 * max(finite, default=1.0)), xlabel="relative error")
+    style.percent_ticks(ax.xaxis)
     if c.tolerance is not None:
         ax.axvline(c.tolerance, color=style.UNSTABLE, lw=0.9, ls="--")
-        ax.set_title(f"dashed: the tolerance {c.tolerance:g} of the reduction", loc="right")
-    few_ticks(ax.xaxis)
+        ax.set_title(f"dashed: the tolerance of the reduction, {percent(c.tolerance)}", loc="right")
 
 
 def figure_batch(answers: QueryResult, file: Path) -> tuple[Path, ...]:
@@ -79,7 +83,7 @@ def figure_batch(answers: QueryResult, file: Path) -> tuple[Path, ...]:
         if shown.any():
             norm = LogNorm(0.9 * errors[shown].min(), 1.1 * errors[shown].max())
             points = ax.scatter(lam[shown], mu[shown], c=errors[shown], norm=norm, cmap="viridis_r", s=28)
-            few_ticks(figure.colorbar(points, label="relative error of the reduction").ax.yaxis)
+            style.percent_ticks(figure.colorbar(points, label="relative error of the reduction").ax.yaxis)
         ax.plot(lam[refused], mu[refused], "x", color=style.UNSTABLE, ms=8)
         if answers.model.box is not None:
             (a, b), (c, d) = answers.model.box.lam, answers.model.box.mu

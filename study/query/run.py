@@ -20,6 +20,7 @@ from softgrasp.reduction.origin import MATERIAL, UNKNOWN
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
 from softgrasp.study.query.page import box_text, compose, result_of
 from softgrasp.study.query.request import drive_of, materials_of, parse_settings, read_batch
+from softgrasp.study.report import percent
 from softgrasp.study.shell import Session, folder_lock, list_files, show_warnings
 
 REFUSED = 3  # exit status
@@ -79,7 +80,7 @@ def run_query(
     session.claim(model.fine.name, lambda: [file for file in (path, motion, scene, batch) if file is not None])
     modes = f"{model.k} modes" + (f", certified by {model.k2}" if model.k < model.k2 else "")
     trained = "" if model.box is None else f", trained for {box_text(model.box)}"
-    limit = "" if model.tolerance is None else f", tolerance {model.tolerance:g}"
+    limit = "" if model.tolerance is None else f", tolerance {percent(model.tolerance)}"
     console.print(f"{path.name}: {model.fine.name}, {modes}{trained}{limit}", soft_wrap=True, markup=False)
     begin = time.perf_counter()
     runs = model.run_batch(many, drive, tolerance=tolerance)

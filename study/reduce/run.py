@@ -46,7 +46,7 @@ def run_reduce(
 ) -> dict[str, Any]:
     """Reduce a scene file by all its methods, or build one certified model, and write the results. Collective."""
     if tolerance is not None:
-        overrides = [*overrides, f"reduction.tolerance={tolerance}", "reduction.train='greedy'"]
+        overrides = [*overrides, f"reduction.tolerance={tolerance}", 'reduction.train="greedy"']
     session = Session("reduce", path, overrides, out, console, **flags)
     scene = session.scene()
     names = check_scene(scene)

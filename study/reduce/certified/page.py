@@ -31,8 +31,8 @@ TESTS: Columns = {
 }  # fmt: skip
 GREEDY: Columns = {
     "round": "number", "trained at lambda [Pa]": lambda r: r["at"][0], "mu [Pa]": lambda r: r["at"][1], "k": "k",
-    "N": "N", "largest bound": lambda r: shown(r["bound"]), "at lambda [Pa]": lambda r: r["worst"][0],
-    "at mu [Pa]": lambda r: r["worst"][1], "bounds computed": "evaluations", "time [s]": "seconds .1f",
+    "N": "N", "largest bound": lambda r: shown(r["bound"]), "where lambda [Pa]": lambda r: r["worst"][0],
+    "where mu [Pa]": lambda r: r["worst"][1], "bounds computed": "evaluations", "time [s]": "seconds .1f",
 }  # fmt: skip
 
 
@@ -55,7 +55,8 @@ def compose(
     query, full = (f"{1e3 * result['time'][key]:.3g} ms" for key in ("query", "full"))
     return Page(
         f"{result['scene']}: certified reduced model", [f"A query takes {query}, a full run {full} with its factor."],
-        parts, tables, [*drawn, file], errors=[error_sentence(certified, result)], warnings=[unknown] * bool(unknown),
+        parts, tables, [*drawn, file], errors=[error_sentence(certified, result)],
+        warnings=[*result["certified"]["own"]["reasons"], *([unknown] if unknown else [])],
     )  # fmt: skip
 
 
@@ -113,7 +114,6 @@ def sentences(certified: CertifiedModel, check: BoxCheck | None, result: dict[st
             )
     lines += [
         f"At the scene's own material: {about['own']['sentence']}.",
-        *about["own"]["reasons"],
     ]
     if check is not None:
         ratios = [t.effectivity for t in check.own.tested if t.truth]

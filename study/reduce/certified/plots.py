@@ -8,10 +8,11 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
-from matplotlib.ticker import MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from softgrasp.reduction import CertifiedModel
 from softgrasp.study.pictures import BLUE, COLUMN, GREEN, HAND, ORANGE, UNSTABLE, few_ticks, paper_style, save
+from softgrasp.study.pictures.style import percent_ticks
 from softgrasp.study.reduce.certified.measure import BoxCheck, Size
 from softgrasp.study.report import percent
 
@@ -53,8 +54,8 @@ def figure_box(own: Size, out_png: Path) -> tuple[Path, ...]:
                 axis.set_ticks(sorted(set(places)), [f"{x:.3g}" for x in sorted(set(places))])
                 axis.set_ticks([], minor=True)
         axes[-1, 0].set_xlabel("λ [Pa]")
-        bar = figure.colorbar(picture, ax=axes[:, 0].tolist(), label="relative error [1]")
-        few_ticks(bar.ax.yaxis)
+        bar = figure.colorbar(picture, ax=axes[:, 0].tolist(), label="relative error")
+        percent_ticks(bar.ax.yaxis)
         return save(figure, out_png)
 
 
@@ -73,10 +74,10 @@ def figure_greedy(certified: CertifiedModel, tolerance: float, out_png: Path) ->
             top = {"transform": left.get_xaxis_transform(), "clip_on": False}
             label = "larger than the deformation"
             left.plot(np.array(k)[~known], np.ones((~known).sum()), "^", color=BLUE, mfc="none", label=label, **top)
-        left.axhline(tolerance, color=UNSTABLE, lw=0.9, ls="--", label=f"tolerance {tolerance:g}")
+        left.axhline(tolerance, color=UNSTABLE, lw=0.9, ls="--", label=f"tolerance {percent(tolerance)}")
         left.set(xlabel="modes k", ylabel="relative bound")
         left.grid(axis="y", color="#e6e6e6", lw=0.5)
-        few_ticks(left.yaxis)
+        percent_ticks(left.yaxis)
         left.legend()
         places: dict[tuple[float, float], list[int]] = {}
         for i, (lam, mu) in enumerate(certified.training["chosen"], 1):
@@ -118,13 +119,13 @@ def figure_sizes(check: BoxCheck, tolerance: float, out_png: Path) -> tuple[Path
             values = np.array([s.largest(key) for s in check.sizes])  # nan, which is not drawn, with one basis
             right.plot(times, values, ls="", marker=marker, color=colour, ms=4.5, mfc="none", label=label)
         right.axvline(1e3 * check.full, color="#888888", lw=1.0, ls="-.", label="full run")
-        right.axhline(tolerance, color=UNSTABLE, lw=0.9, ls="--", label=f"tolerance {tolerance:g}")
+        right.axhline(tolerance, color=UNSTABLE, lw=0.9, ls="--", label=f"tolerance {percent(tolerance)}")
         for i, (time, size) in enumerate(zip(times, check.sizes, strict=True)):
             place, beside = (time, size.largest("bound")), (5, -8 if i % 2 else 2)  # neighbours may stand close
             right.annotate(f"k = {size.k}", place, xytext=beside, textcoords="offset points", fontsize=6.5)
         right.set(xscale="log", yscale="log", xlabel="time of an answer [ms]", ylabel="largest relative error")
         right.grid(axis="y", color="#e6e6e6", lw=0.5)
         few_ticks(right.xaxis)
-        right.yaxis.set_minor_formatter(NullFormatter())
+        percent_ticks(right.yaxis)
         right.legend()
         return save(figure, out_png)

@@ -15,13 +15,19 @@ CAPTIONS = {
     "errors.png": "Error of the deformation against N of each basis, beside the full run in the frame of the hand."
 }
 ERRORS: Columns = {
-    "basis": "method", "N": "N", "deformation": "error %", "velocity": "error_velocity %",
-    "energy norm": "error_energy_norm %", "force on the hand": "error_force %",
+    "basis": "method", "N": "N", "deformation": lambda p: known(p.error), "velocity": lambda p: known(p.error_velocity),
+    "energy norm": lambda p: known(p.error_energy_norm), "force on the hand": "error_force %",
 }  # fmt: skip
+ROUNDED = 1e-7  # a smaller error is a difference of squares that rounding decides
 NOTE = (
     "N counts the hand's 2 n_s. Errors are relative, in the axes of the hand, over all snapshots of the scene's run, "
     "which also made the bases but craig_bampton. Force on the hand: largest difference of an entry over the largest."
 )
+
+
+def known(error: float) -> str:
+    """A relative error in words, as far as rounding leaves it."""
+    return percent(error) if error >= ROUNDED else f"below {percent(ROUNDED)}"
 
 
 def best(points: Sequence[TurningPoint]) -> TurningPoint:
@@ -43,7 +49,10 @@ def compose(
     names = [field.name for field in fields(TurningPoint)]
     table = Table(tuple(names), [tuple(asdict(p).values()) for p in points])
     top = best(points)
-    head = f"The most accurate reduced model, {top.method} with N = {top.N}, has an error of {percent(top.error)}."
+    head = (
+        f"The most accurate reduced model, {top.method} with N = {top.N}, has an error of the deformation of "
+        f"{known(top.error)} against the scene's run."
+    )
     notes = [*dict.fromkeys(p.caution for p in points if p.caution), *(f"{k} refused: {v}" for k, v in refused.items())]
     title = f"{full.model.scene.name}: reduced models in the frame of the hand"
     summary = ["The models turn by any angle with the hand and are linear in the strain."]
