@@ -133,8 +133,7 @@ def thinned(order: Order, v: Array, seen: Array, reach: Array, whole: Array, mos
             stand = np.flatnonzero(w[i, m])
             least[i, stand] = np.maximum(least[i, stand], near[i, m])
             # max(0, d + c.z), which is convex, where it begins behind r: its chord
-            behind = near[i, m] < 0
-            share = max(far[i, m], 0.0) / (far[i, m] - near[i, m]) if behind else 1.0
+            share = 1.0 if near[i, m] >= 0 else far[i, m] / (far[i, m] - near[i, m]) if far[i, m] > 0 else 0.0
             spread[i, stand] = np.maximum(spread[i, stand], share * c[i, m])
     some, every = len(found), np.array(found, dtype=np.int64)
     return Thinned(every, mean[:, every, np.arange(some)] == 1.0, least[:, :some], spread[:, :some])

@@ -133,11 +133,13 @@ SPACE = ("tissue.cells=[2,2,2]", "control.constraints.parts=2", "control.loop.ra
 
 
 def test_a_body_in_space_goes_over_a_box_and_past_a_ball_that_moves() -> None:
-    found = planned("reach_over_3d", *SPACE)
+    found = planned("reach_over_3d", *SPACE, online=True)
     plan, run = found.plan, found.runs.planned
     assert plan.certified
     assert 0 < found.runs.reduction_error <= np.linalg.norm(plan.task.error, axis=1).max()
     assert (run.least >= 0).all()
+    assert found.online is not None
+    assert (found.online.gaps >= 0).all()  # also where the hand holds nodes, which see no mode
     assert found.runs.free.least[0] < -0.02  # the optimal feedback goes through the box
     centers = np.array([0.17, 0.1, 0.2]) + run.times[:, None] * [0.0, 0.0, -0.2]
     assert least_distance(run.body, centers) >= 0.03 + run.least[1] - 1e-12  # rounding

@@ -66,6 +66,16 @@ def test_a_single_node_stands_for_itself() -> None:
     assert not found.least.any()
 
 
+def test_a_held_node_that_is_farther_off_needs_nothing() -> None:
+    """Between two that are nearer, with no mode at any of them: 0 / 0 would drop the rows of both."""
+    order, none = coarse_to_fine(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])), np.zeros((3, 2))
+    found = thinned(order, np.tile([1.0, 1.5, 0.9], (3, 1)), none, none + 0.1, none + 1.0, np.zeros(3))
+    assert found.nodes.tolist() == [0, 2]
+    assert found.stays.all()
+    assert (found.least == 0).all()
+    assert (found.spread == 0).all()
+
+
 def test_nodes_come_from_coarse_to_fine_between_others() -> None:
     for places in PLACES.values():
         order = coarse_to_fine(places)
