@@ -119,7 +119,9 @@ class Loop(Section):
     )
     rate: Positive = Field(1000.0, description="sampling rate [Hz], held only")
     limit: Positive | list[Positive] | None = Field(
-        None, description="largest force on the hand in each direction [N], one number or one per axis; none by default"
+        None,
+        description="largest force on the hand in each direction, and torque where it turns [N, N m], one number or one "
+        "per axis; none by default",
     )
     limit_torque: Positive | list[Positive] | None = Field(
         None,
@@ -183,7 +185,7 @@ class Constraints(Section):
         None, description="largest force on the hand in each direction [N], one number or one per axis; none by default"
     )
     speed: Positive | None = Field(None, description="largest speed of the hand in each direction [m/s]")
-    jump: Positive | None = Field(None, description="largest change of the force from interval to interval [N]")
+    jump: Positive | None = Field(None, description="largest change of the force from interval to interval [N, N m]")
     body: Literal["boundary"] | Annotated[list[Label | list[float]], Field(min_length=1)] = Field(
         "boundary",
         description="what keeps every gap [no unit]: the whole boundary, or some of its nodes with all between them, "

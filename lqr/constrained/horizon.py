@@ -76,7 +76,7 @@ def held_plant(problem: RiccatiProblem, tissue: ModalTissue, grid: float, parts:
     A, B, Y = np.zeros((N, N)), np.zeros((N, n_s)), np.zeros((*tissue.seen.shape[:2], N))
     A[q, v], A[z, w], A[w, z], A[w, w] = np.eye(n_s), np.eye(k), -np.diag(tissue.omega**2), -2 * np.diag(tissue.delta)
     B[v], B[w] = inertia, -tissue.g @ inertia
-    Y[:, :, q], Y[:, :, z] = np.eye(n_s), tissue.seen
+    Y[:, :, q], Y[:, :, z] = np.eye(n_s) if tissue.rigid is None else tissue.rigid, tissue.seen
     C = np.zeros((len(problem.Q), N))
     C[:, q], C[:, z] = problem.C_s, tissue.c
     A_d, B_d = held(A, B, grid)

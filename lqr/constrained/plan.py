@@ -18,7 +18,7 @@ from softgrasp.fem.obstacles.shapes import HalfSpace, Shape
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.resources import free_memory, size_text
 from softgrasp.lqr.constrained.horizon import HeldPlant, Horizon
-from softgrasp.lqr.constrained.rows import bends, both_ends, broken, follow, gap_rows, limit_rows, tail_level
+from softgrasp.lqr.constrained.rows import bends, both_ends, broken, follow, gap_rows, limit_rows, tail_level, turned
 from softgrasp.lqr.constrained.separation import past, separate
 from softgrasp.lqr.constrained.task import Task, after_paths, at_target, free_ways, instants, path_turns, seen_by
 from softgrasp.lqr.plant.checks import ControlError
@@ -46,7 +46,7 @@ class Plan:
     c: Array  # deviations from the gain of the grid, (n_s H,)
     normals: Array  # of the half-plane of every obstacle and interval, (obstacles, H, d)
     slack: Array  # depth inside clearance and margin, by obstacle and interval [m], (obstacles, H)
-    bend: float  # largest bound on what a node that holds the plan does between two instants [m]
+    bend: float  # largest bound on what a node that holds the plan does between two instants, and off small angles [m]
     multiplier: float  # largest dJ of a metre of one gap at one instant, twice its multiplier in |c|^2 / 2 [1/m]
     active: tuple[int, ...]  # rows that hold the plan, empty where gaps are not kept
     costs: tuple[float, ...]  # |c|^2 of the rounds
@@ -135,7 +135,7 @@ def make_plan(plant: HeldPlant, task: Task, steps: int, longest: int | None = No
     if automatic:
         _check_in_time(plant, task, longest * plant.grid)
     while True:
-        level = tail_level(plant, at_target(task, steps * plant.grid), task.limits, task.u_bar)
+        level = tail_level(plant, at_target(task, steps * plant.grid), task.limits, task.u_bar, task.arms, task.angle)
         if not level > 0:
             raise ControlError("the steady force at the target is not below its limit; raise control.constraints.force")
         _check_memory(plant, task, steps)
@@ -164,7 +164,7 @@ def _check_in_time(plant: HeldPlant, task: Task, longest: float) -> None:
     if task.limits.force is not None:
         fastest = np.abs(plant.B[n_s : 2 * n_s]) @ (task.limits.force + np.abs(task.u_bar))
         least = float((2 * np.sqrt(way / fastest)).max())
-    least = max(least, float((way / speed).max()))
+    least = max(least, float((way[: plant.Y.shape[1]] / speed).max()))
     if least > longest:
         raise ControlError(
             f"within its limits the hand needs at least {least:.4g} s to the target, and a plan lasts {longest:.4g} s "
@@ -264,9 +264,10 @@ def _rows(horizon: Horizon, task: Task, normals: Array, c: Array) -> tuple[Array
     """Rows of all obstacles with room for the bends of the plan c, and the group of each: its obstacle and interval."""
     rows, right = [np.zeros((0, len(c)))], [np.zeros(0)]
     x, u = horizon.state(task.start, c), horizon.input(task.start, c)
+    off = _off_angle(horizon.plant, task, x, u)
     rounding = ROUNDING * task.size  # so that no gap of the plan is below zero by it
     for i, (shape, n) in enumerate(zip(task.shapes, normals, strict=True)):
-        margin = ROOM * both_ends(bends(horizon.plant, x, u, n, path_turns(horizon, task, i, n)))
+        margin = ROOM * (both_ends(bends(horizon.plant, x, u, n, path_turns(horizon, task, i, n))) + off)
         moved = np.einsum("kd,kid->ki", n, task.shifts(i, instants(horizon)))[:, :, None]
         G, h = gap_rows(horizon, task.start, n, free_ways(shape, task, n)[:, None] - moved - margin - rounding)
         rows.append(G)
@@ -275,6 +276,11 @@ def _rows(horizon: Horizon, task: Task, normals: Array, c: Array) -> tuple[Array
     count = len(normals) * horizon.steps
     group = np.repeat(np.arange(count), len(h) // max(count, 1))
     return np.vstack(rows), h, group
+
+
+def _off_angle(plant: HeldPlant, task: Task, x: Array, u: Array) -> Array | float:
+    """How far nodes may be from where small angles have them, (H, parts + 1, nodes) [m]."""
+    return 0.0 if task.angle is None else turned(plant, x, u, np.asarray(task.arms), task.angle)
 
 
 def _solve(
@@ -308,13 +314,13 @@ def _judged(
     if len(u) - H == MOST_FOLLOWED:
         unsafe[-1] = True
     gap, bend = np.inf, 0.0
-    target = at_target(task, H * plant.grid)
+    target, off = at_target(task, H * plant.grid), _off_angle(plant, task, x, u)
     for i, (shape, ahead, (normal, _)) in enumerate(zip(task.shapes, normals, target, strict=True)):
         n = np.concatenate([ahead, np.tile(normal, (len(u) - H, 1))])
         turns = path_turns(horizon, task, i, n)
         if len(u) > H and not isinstance(turns, float):
             turns[H:] = 0.0  # it rests, or goes away along a line
-        own = both_ends(bends(plant, x, u, n, turns))
+        own = both_ends(bends(plant, x, u, n, turns)) + off
         left = _left(shape, task, n, seen_by(horizon, task, i, body)) - own
         gap = min(gap, float(left.min()))
         unsafe |= (left < 0).any(axis=(1, 2))

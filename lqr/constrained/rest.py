@@ -93,7 +93,8 @@ def known_tissue(problem: RiccatiProblem, surface: Surface) -> tuple[ModalTissue
         seen, c = seen + hand, c + problem.C_s @ hand
     damping = system.damping
     omega = np.concatenate([omega, np.sqrt(squares)])
-    return ModalTissue(omega, damping.alpha, damping.beta, g, seen, c, None, None, len(g) - len(squares), hand), V
+    return ModalTissue(omega, damping.alpha, damping.beta, g, seen, c, None, None, len(g) - len(squares), hand,
+                       surface.rigid), V  # fmt: skip
 
 
 def run_rest(problem: RiccatiProblem, surface: Surface, known: ModalTissue, V: Array, grid: float) -> Rest:

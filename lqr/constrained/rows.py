@@ -21,7 +21,7 @@ class Limits:
     """Bounds of the hand; None for none."""
 
     force: Array | None = None  # on |u_i| [N], (n_s,)
-    speed: float | None = None  # on |v_i| [m/s]
+    speed: float | None = None  # on |v_i| along the axes [m/s]
     jump: float | None = None  # on |u_i| from interval to interval [N]
 
 
@@ -52,7 +52,7 @@ def limit_rows(horizon: Horizon, start: Array, limits: Limits, u_bar: Array) -> 
     if limits.force is not None:
         parts.append((V, U @ start, -limits.force - u_bar, limits.force - u_bar))
     if limits.speed is not None:
-        v, most = slice(n_s, 2 * n_s), np.full(n_s, limits.speed)
+        v, most = speeds(horizon.plant), np.full(horizon.plant.Y.shape[1], limits.speed)
         parts.append((G[1:, v], F[1:, v] @ start, -most, most))
     if limits.jump is not None:
         most = np.full(n_s, limits.jump)
@@ -85,8 +85,12 @@ def bends(plant: HeldPlant, states: Array, inputs: Array, normals: Array, turns:
     moving = np.einsum("men,kin->kime", T, states[:, :-1]) + np.einsum("mes,ks->kme", W, inputs)[:, None]
     seen = np.abs(np.einsum("kd,jdm->kjm", normals, plant.tissue.seen))
     tissue = np.einsum("kjm,kim->kij", seen, np.linalg.norm(moving, axis=-1) * _pace(plant))
-    along = np.einsum("kd,ks,ds->k", normals, inputs, plant.B[plant.n_s : 2 * plant.n_s])
-    rigid = (along[:, None] + turns)[:, :, None]
+    M_inv = plant.B[plant.n_s : 2 * plant.n_s]
+    if plant.tissue.rigid is None:
+        along = np.einsum("kd,ks,ds->k", normals, inputs, M_inv)[:, None]
+    else:
+        along = np.einsum("kd,ks,es,jde->kj", normals, inputs, M_inv, plant.tissue.rigid, optimize=True)
+    rigid = along[:, None, :] + np.asarray(turns)[..., None]
     return np.asarray((plant.grid / plant.parts) ** 2 / 8 * np.maximum(tissue + rigid, 0.0))
 
 
@@ -101,7 +105,14 @@ def both_ends(bend: Array) -> Array:
     return np.asarray(np.maximum(padded[:, 1:], padded[:, :-1]))
 
 
-def tail_level(plant: HeldPlant, gaps: list[tuple[Array, Array]], limits: Limits, u_bar: Array) -> float:
+def tail_level(
+    plant: HeldPlant,
+    gaps: list[tuple[Array, Array]],
+    limits: Limits,
+    u_bar: Array,
+    arms: Array | float = 0.0,
+    angle: Array | None = None,
+) -> float:
     """alpha: from every x with x'P x <= alpha the loop u = K x keeps all gaps and limits for ever.
 
     x'P x falls, so that |r x| <= sqrt(x'P x) |r P^{-1/2}| for every row r: at all instants of all later intervals, and
@@ -110,6 +121,8 @@ def tail_level(plant: HeldPlant, gaps: list[tuple[Array, Array]], limits: Limits
     Args:
         gaps: normal (d,) and free way of every node against it at the target, (nodes,), of each obstacle.
         u_bar: steady input [N], (n_s,).
+        arms: |r_j| of every node of a hand that turns, (nodes,) [m].
+        angle: of this hand at the target, (n_s - d,) [rad].
 
     Negative where the target itself violates a gap or a limit.
     """
@@ -121,27 +134,65 @@ def tail_level(plant: HeldPlant, gaps: list[tuple[Array, Array]], limits: Limits
     size = np.linalg.norm(swing, ord=2, axis=(-2, -1)) * _pace(plant)  # (parts, modes)
     most: list[Array] = []
     room: list[Array] = []
+    # |r| ((theta_bar + t s)^2 - theta_bar^2) / 2 = |r| theta_bar t s + |r| t^2 s^2 / 2 for s = sqrt(x'P x)
+    t, theta, squares = 0.0, 0.0, list[Array]()
+    if angle is not None:
+        d = plant.Y.shape[1]
+        t = float(np.linalg.norm(root[d:n_s], 2))
+        t += (plant.grid / plant.parts) ** 2 / 8 * float(np.linalg.norm(M_inv[d:] @ plant.K @ root, 2))
+        theta = float(np.linalg.norm(angle))
     for normal, free in gaps:
         rows = np.linalg.norm(np.einsum("d,jdn,inr->ijr", normal, plant.Y, flows), axis=-1)
         seen = np.abs(np.einsum("d,jdm->jm", normal, plant.tissue.seen))
-        bend = np.einsum("jm,im->ij", seen, size) + np.linalg.norm(normal @ M_inv @ plant.K @ root)
+        bend = np.einsum("jm,im->ij", seen, size) + _size_along(plant, normal, M_inv @ plant.K @ root)
         bend = (plant.grid / plant.parts) ** 2 / 8 * bend
-        most.append((rows + both_ends(bend[None])[0]).ravel())
+        most.append((rows + both_ends(bend[None])[0] + arms * theta * t).ravel())
+        squares.append(np.broadcast_to(arms * t**2 / 2, rows.shape).ravel())
         room.append(np.broadcast_to(free, rows.shape).ravel())
     if limits.force is not None:
         most.append(np.linalg.norm(plant.K @ root, axis=1))
         room.append(limits.force - np.abs(u_bar))
     if limits.speed is not None:
-        most.append(np.linalg.norm(root[n_s : 2 * n_s], axis=1))
-        room.append(np.full(n_s, limits.speed))
+        most.append(np.linalg.norm(root[speeds(plant)], axis=1))
+        room.append(np.full(plant.Y.shape[1], limits.speed))
     if limits.jump is not None:
         most.append(np.linalg.norm(plant.K @ (plant.closed - np.eye(plant.N)) @ root, axis=1))
         room.append(np.full(n_s, limits.jump))
     if not most:
         return np.inf
-    ratio = np.concatenate(room) / np.concatenate(most)
-    least = float(ratio.min())
+    all_room, all_most = np.concatenate(room), np.concatenate(most)
+    curve = np.concatenate([*squares, np.zeros(len(all_most) - sum(map(len, squares)))])
+    # the least s with most s + curve s^2 = room
+    bent = 1 + 4 * curve * np.maximum(all_room, 0.0) / all_most**2
+    least = float((2 * all_room / all_most / (1 + np.sqrt(bent))).min())
     return float(np.sign(least) * least**2)
+
+
+def _size_along(plant: HeldPlant, normal: Array, accelerations: Array) -> Array:
+    """Norm of n.R_j a for every node, or once for all; a (n_s, r)."""
+    if plant.tissue.rigid is None:
+        return np.asarray(np.linalg.norm(normal @ accelerations))
+    return np.asarray(np.linalg.norm(np.einsum("d,jds->js", normal, plant.tissue.rigid) @ accelerations, axis=1))
+
+
+def speeds(plant: HeldPlant) -> slice:
+    """Velocities of the hand along the axes in a state."""
+    return slice(plant.n_s, plant.n_s + plant.Y.shape[1])
+
+
+def turned(plant: HeldPlant, states: Array, inputs: Array, arms: Array, angle: Array) -> Array:
+    """Bound on how far nodes are from where small angles have them, (H, parts + 1, nodes) [m]: |r_j| theta^2 / 2.
+
+    Args:
+        states: at all instants, (H, parts + 1, N); ``inputs``: (H, n_s).
+        arms: |r_j| of every node, (nodes,) [m].
+        angle: of the hand at the target, (n_s - d,) [rad].
+    """
+    n_s, d = plant.n_s, plant.Y.shape[1]
+    theta = np.linalg.norm(states[..., d:n_s] + angle, axis=-1)
+    leaves = (plant.grid / plant.parts) ** 2 / 8 * np.linalg.norm(inputs @ plant.B[n_s + d : 2 * n_s].T, axis=1)
+    theta = np.maximum(theta[:, 1:], theta[:, :-1]) + leaves[:, None]
+    return both_ends(theta[:, :, None] ** 2 / 2 * arms)
 
 
 def follow(plant: HeldPlant, x: Array, level: float, most: int) -> tuple[Array, Array]:
@@ -160,12 +211,12 @@ def follow(plant: HeldPlant, x: Array, level: float, most: int) -> tuple[Array, 
 
 def broken(plant: HeldPlant, states: Array, inputs: Array, limits: Limits, u_bar: Array) -> Array:
     """Intervals whose inputs, last speed or jump from the one before exceed the limits, beyond rounding; (H,)."""
-    slack, n_s = 1 + 1e-9, plant.n_s  # rounding of a plan that keeps its rows with equality
+    slack = 1 + 1e-9  # rounding of a plan that keeps its rows with equality
     result = np.zeros(len(inputs), dtype=bool)
     if limits.force is not None:
         result |= (np.abs(inputs + u_bar) > slack * limits.force).any(axis=1)
     if limits.speed is not None:
-        result |= (np.abs(states[:, -1, n_s : 2 * n_s]) > slack * limits.speed).any(axis=1)
+        result |= (np.abs(states[:, -1, speeds(plant)]) > slack * limits.speed).any(axis=1)
     if limits.jump is not None:
         result |= (np.abs(np.diff(inputs, axis=0, prepend=0.0)) > slack * limits.jump).any(axis=1)
     return result

@@ -50,7 +50,9 @@ def watching(problem: RiccatiProblem, surface: Surface) -> RiccatiProblem:
     C_z = np.zeros((problem.layout.n_local, d * surface.free), order="F")
     for i, rows in enumerate(surface.rows, surface.first):
         C_z[rows, d * i + np.arange(d)] = 1.0
-    C_s = np.vstack([problem.C_s, np.tile(np.eye(d, n_s), (surface.free, 1))])
+    rigid = surface.rigid
+    hand = np.tile(np.eye(d, n_s), (surface.free, 1)) if rigid is None else rigid[: surface.free].reshape(-1, n_s)
+    C_s = np.vstack([problem.C_s, hand])
     Q = scipy.linalg.block_diag(problem.Q, np.zeros((d * surface.free,) * 2))
     return replace(problem, C_s=C_s, C_z=np.hstack([problem.C_z, C_z]), Q=Q, columns=())
 
@@ -115,7 +117,7 @@ def run_plan(
         for t, seen in ((tissue, tissue.seen), (plant.tissue, plant.tissue.seen), (tissue, tissue.relative))
     )
     at = (np.arange(len(inputs))[:, None] * each + np.arange(plant.parts + 1) * STEPS).ravel()
-    hand, places = runs[0].q_s[at][:, None], plan.task.places - target.state.q_s
+    hand, places = surface.keeping().with_hand(runs[0].q_s[at] - target.state.q_s), plan.task.places
     off = surface.of(planned.body)[at] - (places + hand) - off_hand.reshape(len(at), *places.shape)
     return PlanRuns(planned, free, dt, _largest(exact - reduced), _largest(off))
 
@@ -173,7 +175,8 @@ def body_run(
 ) -> BodyRun:
     """Places, gaps and cost of a run of the watched plant. Collective."""
     moved = run.outputs[:, len(problem.Q) :].reshape(len(run.times), -1, problem.layout.dimension)
-    held = np.repeat(run.q_s[:, None, : problem.layout.dimension], len(surface.nodes) - surface.free, axis=1)
+    shape = len(run.times), len(surface.nodes) - surface.free, problem.layout.dimension
+    held = np.broadcast_to(surface.with_hand(run.q_s)[:, -shape[1] :] if shape[1] else np.zeros(shape), shape)
     body = surface.nodes + np.concatenate([moved, held], axis=1)
 
     to_come = predicted_cost(problem, solution, run.final - target.state)

@@ -32,6 +32,8 @@ class Task:
     bounded: bool = True  # whether ``error`` is a proved bound
     penalty: float | None = None  # cost of a metre inside an obstacle [1/m]; None: many times that of the way
     paths: tuple[Path | None, ...] = ()  # translation of each obstacle; empty where all are fixed
+    arms: Array | float = 0.0  # |r_j| from a hand that turns, whose square of the angle has a margin [m], (nodes,)
+    angle: Array | None = None  # of this hand at the target, (n_s - d,) [rad]; None: it does not turn
     extent: float = 0.0  # longest side of the body [m]; 0: that of ``places``, where all keep gaps
 
     @property
@@ -113,6 +115,8 @@ def at_target(task: Task, t: float) -> list[tuple[Array, Array]]:
 def _free_at(task: Task, i: int, normal: Array, t: float) -> Array:
     """Way of every node at the target to the half-space of an obstacle at a time, less clearance and margin."""
     free = free_ways(task.shapes[i], task, normal[None])[0]
+    if task.angle is not None:
+        free = free - task.arms * float(task.angle @ task.angle) / 2
     return np.asarray(free - normal @ task.shifts(i, np.asarray(t)))
 
 

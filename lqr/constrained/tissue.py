@@ -4,7 +4,8 @@ One-way the tissue hears the hand through its acceleration a = M_s^{-1} (u - u_b
 
     eta'' + 2 delta eta' + omega^2 eta = -g a,    y_j = Y_j + q_s - q_bar + S_j eta
 
-for the place y_j of node j, Y_j at the target, eta = 0 in equilibrium, 2 delta = alpha + beta omega^2.
+for the place y_j of node j, Y_j at the target, eta = 0 in equilibrium, 2 delta = alpha + beta omega^2. With a hand that
+turns, by small angles, R_j (q_s - q_bar) stands for its displacement.
 
 A hand that feels the tissue, M_s q_s'' + G'z'' = u, is the same plant about the centre of mass r = q_s + M_s^{-1} G'z,
 
@@ -46,6 +47,7 @@ class ModalTissue:
     same: NDArray[np.int64] | None = None  # of a reduced one, number of the same mode of the full one, else -1, (k,)
     lowest: int | None = None  # number of modes where they are not all: static answers K^{-1} G follow them; else None
     hand: Array | None = None  # S_hand of a hand that feels the tissue, (n_s, k); else None
+    rigid: Array | None = None  # R_j, motion of the nodes with a hand that turns, (nodes, d, n_s); else None
 
     @property
     def delta(self) -> Array:
@@ -75,8 +77,9 @@ class ModalTissue:
         V = V[:, order]
         hand = None if self.hand is None else self.hand @ V
         return ModalTissue(
-            omega[order], self.alpha, self.beta, V.T @ self.g, self.seen @ V, self.c @ V, V, same[order], None, hand
-        )
+            omega[order], self.alpha, self.beta, V.T @ self.g, self.seen @ V, self.c @ V, V, same[order], None, hand,
+            self.rigid,
+        )  # fmt: skip
 
     @property
     def relative(self) -> Array:
@@ -140,6 +143,7 @@ class Surface:
     free: int  # number of free ones
     nodes: Array  # places in the undeformed body [m], (nodes, d)
     kept: NDArray[np.int64] | None = None  # numbers of those that keep gaps, ascending; None: all
+    rigid: Array | None = None  # R_j, motion of the nodes with a hand that turns, (nodes, d, n_s); else None
 
     def keeping(self) -> Surface:
         """The nodes that keep gaps, as a surface of their own."""
@@ -147,7 +151,22 @@ class Surface:
             return self
         here = self.kept[(self.kept >= self.first) & (self.kept < self.first + len(self.rows))] - self.first
         first, free = (int(np.searchsorted(self.kept, number)) for number in (self.first, self.free))
-        return Surface(self.rows[here], first, free, self.nodes[self.kept])
+        rigid = None if self.rigid is None else self.rigid[self.kept]
+        return Surface(self.rows[here], first, free, self.nodes[self.kept], None, rigid)
+
+    def with_hand(self, q_s: Array) -> Array:
+        """Displacement of the nodes with the hand alone, q_s (.., n_s), (.., nodes or 1, d)."""
+        if self.rigid is None:
+            return np.asarray(q_s[..., None, :])
+        return np.asarray(np.einsum("jds,...s->...jd", self.rigid, q_s))
+
+    @property
+    def arms(self) -> Array:
+        """Distances of the nodes from the point about which the hand turns [m], (nodes,); zero where it does not."""
+        d = self.nodes.shape[1]
+        if self.rigid is None:
+            return np.zeros(len(self.nodes))
+        return np.asarray(np.sqrt((self.rigid[:, :, d:] ** 2).sum(axis=(1, 2)) / (d - 1)))
 
     def of(self, body: Array) -> Array:
         """The nodes that keep gaps, of places of all, (.., nodes, d)."""
@@ -175,7 +194,9 @@ def modal_tissue(problem: RiccatiProblem, surface: Surface, loop: ModalLoop | No
     plant = (loop or ModalLoop(problem, DENSE_LIMIT)).plant
     seen = np.zeros((len(surface.nodes), d, len(plant.omega)))
     seen[: surface.free] = rows_on_all(layout.comm, plant.Phi[surface.rows])
-    tissue = ModalTissue(plant.omega, system.damping.alpha, system.damping.beta, plant.g, seen, plant.c)
+    tissue = ModalTissue(
+        plant.omega, system.damping.alpha, system.damping.beta, plant.g, seen, plant.c, rigid=surface.rigid
+    )
     return on_root(layout.comm, lambda: _about_centre(problem, tissue)) if system.two_way else tissue
 
 
@@ -200,8 +221,8 @@ def _not_planned(problem: RiccatiProblem) -> str:
     system, layout = problem.system, problem.layout
     if layout.order != 1:
         return f"elements of order 1, whose edges stay straight; this scene has order {layout.order}"
-    if layout.n_s != layout.dimension:
-        return "a hand that does not turn; set effects.rotation to false"
+    if layout.n_s != layout.dimension and system.two_way:
+        return "a hand that does not turn, or does not feel the tissue; leave out effects.rotation or effects.reaction"
     if system.two_way and system.damping.alpha:
         return "a hand that feels the tissue only with Kelvin-Voigt damping; set effects.damping.alpha to zero"
     if system.points is not None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.constrained.tissue import Surface, make_surface
 from softgrasp.lqr.design.scene import control_of
@@ -22,7 +23,10 @@ def body_surface(model: Model) -> Surface:
     Raises ControlError: a point lies outside the body, a name is that of no node on the boundary, or two take one node.
     """
     layout, given = model.system.layout, control_of(model).constraints
-    surface = make_surface(layout, *model.space.surface())
+    surface, d = make_surface(layout, *model.space.surface()), layout.dimension
+    if layout.n_s > d:
+        rigid = rigid_modes(surface.nodes, d, True, layout.reference)
+        surface = replace(surface, rigid=rigid.reshape(-1, d, layout.n_s))
     if given is None or given.body == "boundary":
         return surface
     nodes = layout.rounded(surface.nodes)

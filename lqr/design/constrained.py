@@ -161,6 +161,7 @@ def plan_control(
         task = Task(
             begin, target, design.target.u, bodies, names, error, given.clearance + estimated, limits, noise,
             given.margin == "bound", penalty, tuple(o.path for o in obstacles),
+            near.arms, None if near.rigid is None else design.target.state.q_s[plant.layout.dimension :],
             float(np.ptp(surface.nodes, axis=0).max()),
         )  # fmt: skip
         steps = first_horizon(design.model, plant)
@@ -279,4 +280,4 @@ def _places(plant: RiccatiProblem, surface: Surface, design: Design) -> Array:
     state, d = design.target.state, plant.layout.dimension
     z = np.zeros((len(surface.nodes), d))
     z[surface.first : surface.first + len(surface.rows)] = state.z[surface.rows]
-    return np.asarray(surface.nodes + state.q_s[:d] + total(plant.layout.comm, z))
+    return np.asarray(surface.nodes + surface.with_hand(state.q_s) + total(plant.layout.comm, z))

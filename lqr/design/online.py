@@ -115,6 +115,8 @@ def run_online(
     problem = design.problem
     if problem.system.two_way:
         return None, "the hand feels the tissue; a plan is made again online for one that does not"
+    if known.surface.rigid is not None:
+        return None, "the hand turns; a plan is made again online for one that does not"
     try:
         controller = planned_controller(design, plan, known.shapes, observed)
     except ControlError as error:

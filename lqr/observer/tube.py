@@ -27,7 +27,7 @@ def node_rows(tissue: ModalTissue, n_s: int) -> Array:
     """Displacement of every node of the body of a state [q_s, v_s, omega eta, eta'], (nodes, d, n)."""
     nodes, d, k = tissue.seen.shape
     rows = np.zeros((nodes, d, 2 * n_s + 2 * k))
-    rows[:, :, :n_s] = np.eye(d, n_s)
+    rows[:, :, :n_s] = np.eye(d, n_s) if tissue.rigid is None else tissue.rigid
     rows[:, :, 2 * n_s : 2 * n_s + k] = tissue.seen / tissue.omega
     return rows
 

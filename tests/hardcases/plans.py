@@ -129,7 +129,10 @@ PLANS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
                                           "obstacle.0.offset=-6.5"), 0.0),
     ("hand that feels the tissue, of limited speed", (f"obstacle=[{WALL}]", "effects.reaction=true"), None),
     ("hand that turns", (f"obstacle=[{WALL}]", "effects.rotation=true", "hand.inertia=5.0",
-                       "motion.target=[5.0, 3.0, 0.0]", "control.outputs=[{kind='hand'}]"), None),
+                       "motion.target=[5.0, 3.0, 0.0]", "control.outputs=[{kind='hand'}]"), 0.0),
+    ("hand that turns and feels the tissue", (
+        f"obstacle=[{WALL}]", "effects.rotation=true", "effects.reaction=true", "hand.inertia=5.0",
+        "motion.target=[5.0, 3.0, 0.0]", "control.outputs=[{kind='hand'}]", NO_SPEED), None),
     ("wall with a micrometre more than the margins", (
         "obstacle=[{kind='halfspace', normal=[-1, 0], offset=-6.001001}]", "control.constraints.margin=1e-3",
     ), 0.0),

@@ -16,7 +16,7 @@ from softgrasp.fem import AXES, PictureMesh
 from softgrasp.fem.obstacles.shapes import Ball, HalfSpace, Polytope, Shape
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr import PlannedControl, Task
-from softgrasp.study.control.obstacle.result import PlannedStudy
+from softgrasp.study.control.obstacle.result import PlannedStudy, freedoms
 from softgrasp.study.pictures import draw_obstacle, style
 
 SHOWN = (0.0, 0.12, 0.28, 0.45, 0.62, 0.8, 1.0)  # shares of the way at which the body is drawn
@@ -213,16 +213,17 @@ def figure_gaps(planned: PlannedControl, out_png: Path) -> tuple[Path, ...]:
         gaps.axhline(margin, **LIMIT, label="clearance and margins")
         gaps.set_ylabel("gap [m]")
         gaps.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5)
-        for j, axis in enumerate(AXES[: run.inputs.shape[1]]):
+        for j, (axis, _) in enumerate(freedoms(planned)):
             force.plot(
-                run.times[:-1][thin], run.inputs[thin, j], color=style.CYCLE[j], label=axis, drawstyle="steps-post"
+                run.times[:-1][thin], run.inputs[thin, j], color=style.CYCLE[j % 4], label=axis, drawstyle="steps-post"
             )
-            speed.plot(run.times[thin], run.v_s[thin, j], color=style.CYCLE[j], label=axis)
+            speed.plot(run.times[thin], run.v_s[thin, j], color=style.CYCLE[j % 4], label=axis)
         for ax, limit in ((force, task.limits.force), (speed, task.limits.speed)):
             for level in () if limit is None else np.unique(np.atleast_1d(limit)):
                 ax.axhline(level, **LIMIT)
                 ax.axhline(-level, **LIMIT)
-        force.set_ylabel("force on the hand [N]")
-        speed.set(xlabel="$t$ [s]", ylabel="speed of the hand [m/s]")
+        turns = task.angle is not None
+        force.set_ylabel("force on the hand [N" + (", N m]" if turns else "]"))
+        speed.set(xlabel="$t$ [s]", ylabel="speed of the hand [m/s" + (", rad/s]" if turns else "]"))
         force.legend(ncols=2, loc="upper right")
         return style.save(figure, out_png)

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem import AXES
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr import Plan
+from softgrasp.lqr import Plan, PlannedControl
 from softgrasp.lqr.design.constrained import FinitePlan
-from softgrasp.study.control.obstacle.result import PlannedStudy
+from softgrasp.study.control.obstacle.result import PlannedStudy, freedoms
 from softgrasp.study.report import Section, Table, captioned, in_words, percent
 from softgrasp.study.report.document import number
 
@@ -59,8 +58,12 @@ def plan_table(study: PlannedStudy) -> Table:
     """Force of every interval, and the hand and the least gaps of the full plant in it."""
     run, grid = study.planned.runs.planned, study.planned.plan.horizon.plant.grid
     each = round(grid / study.planned.runs.dt)
-    axes = AXES[: run.inputs.shape[1]]
-    header = ["t [s]", *(f"u_{x} [N]" for x in axes), *(f"v_{x} [m/s]" for x in axes)]
+    axes = freedoms(study.planned)
+    header = [
+        "t [s]",
+        *(f"u_{x} [{'N m' if turns else 'N'}]" for x, turns in axes),
+        *(f"v_{x} [{'rad/s' if turns else 'm/s'}]" for x, turns in axes),
+    ]
     gaps = [run.gaps[n : n + each + 1].min(axis=0) for n in range(0, len(run.inputs), each)]
     rows = np.column_stack([run.times[:-1:each], run.inputs[::each], run.v_s[:-1:each], np.array(gaps)])
     names = [f"least gap to {name} [m]" for name in study.planned.names]
@@ -101,7 +104,10 @@ def facts(study: PlannedStudy) -> list[tuple[str, str]]:
                 "margin for the reduced plant",
                 f"{task.error.max():.3g} m, its error in this plan {runs.reduction_error:.2g} m{_behind(study)}",
             ),
-            ("margin between two instants", f"{plan.bend:.2g} m where a gap is active"),
+            (
+                "margin between two instants" + (" and for the square of the angle" if task.angle is not None else ""),
+                f"{plan.bend:.2g} m where a gap is active",
+            ),
             ("clearance", f"{task.clearance - study.margin_finite:.3g} m"),
             ("error of the run's own step", f"{runs.step_error:.2g} m, measured against {_modes(study)}"),
             ("cost of a metre of one gap at one instant", f"{plan.multiplier:.3g} at most"),
@@ -117,8 +123,8 @@ def facts(study: PlannedStudy) -> list[tuple[str, str]]:
     rows += [
         ("excess cost", f"{percent(study.excess)}, of which held forces {percent(study.excess_held)}"),
         ("cost predicted and run", f"{plan.cost:.6g} and {runs.planned.cost:.6g}"),
-        ("largest force", in_words([f"{x:.3g} N" for x in np.abs(runs.planned.inputs).max(axis=0)])),
-        ("largest speed", in_words([f"{x:.3g} m/s" for x in np.abs(runs.planned.v_s).max(axis=0)])),
+        ("largest force", _largest(study.planned, runs.planned.inputs, "N", "N m")),
+        ("largest speed", _largest(study.planned, runs.planned.v_s, "m/s", "rad/s")),
         ("rounds and steps of the active set", f"{len(plan.costs)} and {plan.steps} on the way that was chosen"),
     ]
     if len(plan.tried) > 1:
@@ -163,10 +169,11 @@ def _noisy(study: PlannedStudy) -> list[tuple[str, str]]:
     if counts["soft"]:
         words += f", {counts['soft']} gave up gaps by {max(entry.depth for entry in online.log):.2g} m at most"
     program = online.controller.planner
+    overlap = ": the body overlaps an obstacle" if online.gaps.min() < 0 else ""
     return [
         *rows,
         ("planned again online", words),
-        ("least gap of that run", f"{online.gaps.min():.3g} m, {'with' if noisy else 'without'} noise"),
+        ("least gap of that run", f"{online.gaps.min():.3g} m, {'with' if noisy else 'without'} noise{overlap}"),
         (
             "program online",
             f"{program.count(0)} of {study.rows} rows, which imply all that can become active; "
@@ -198,6 +205,12 @@ def _behind(study: PlannedStudy) -> str:
         if part is None
         else f"; it comes from runs of the full plant, whose time steps have an error of {part:.1g} m at most"
     )
+
+
+def _largest(planned: PlannedControl, values: Array, unit: str, turning: str) -> str:
+    """Largest of every freedom of the hand, (times, n_s)."""
+    units = [turning if turns else unit for _, turns in freedoms(planned)]
+    return in_words([f"{x:.3g} {of}" for x, of in zip(np.abs(values).max(axis=0), units, strict=True)])
 
 
 def _held(plan: Plan) -> str:

@@ -7,12 +7,21 @@ from typing import Any
 
 import numpy as np
 
+from softgrasp.fem import AXES
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr import PlannedControl
 from softgrasp.lqr.design.constrained import FinitePlan
 from softgrasp.lqr.program.replan import Outcome
 
 ZERO = 1e-12  # of the largest coordinate: rounding of the mesh
+
+
+def freedoms(planned: PlannedControl) -> list[tuple[str, bool]]:
+    """Names of the freedoms of the hand, and whether they turn it."""
+    run = planned.runs.planned
+    d, n_s = run.body.shape[2], run.inputs.shape[1]
+    turns = ["turn"] if d == 2 else [f"turn_{axis}" for axis in AXES]
+    return [(axis, False) for axis in AXES[:d]] + [(name, True) for name in turns[: n_s - d]]
 
 
 @dataclass(frozen=True)
