@@ -119,9 +119,7 @@ class Loop(Section):
     )
     rate: Positive = Field(1000.0, description="sampling rate [Hz], held only")
     limit: Positive | list[Positive] | None = Field(
-        None,
-        description="largest force on the hand in each direction, and torque where it turns [N, N m], one number or one "
-        "per axis; none by default",
+        None, description="largest force on the hand in each direction [N], one number or one per axis; none by default"
     )
     limit_torque: Positive | list[Positive] | None = Field(
         None,
@@ -182,7 +180,9 @@ class Constraints(Section):
     """Plan of piecewise constant forces past every [[obstacle]], within the limits of the hand, with its margins."""
 
     force: Positive | list[Positive] | None = Field(
-        None, description="largest force on the hand in each direction [N], one number or one per axis; none by default"
+        None,
+        description="largest force on the hand in each direction, and torque where it turns [N, N m], one number or "
+        "one per axis; none by default",
     )
     speed: Positive | None = Field(None, description="largest speed of the hand in each direction [m/s]")
     jump: Positive | None = Field(None, description="largest change of the force from interval to interval [N, N m]")

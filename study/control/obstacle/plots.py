@@ -78,7 +78,8 @@ def figure_bodies(planned: PlannedControl, picture: PictureMesh, out_png: Path) 
 
 def figure_views(planned: PlannedControl, picture: PictureMesh, out_png: Path) -> tuple[Path, ...]:
     """Outlines of a body in space at some instants under the plan, from the front and from above; PNG and PDF."""
-    run = planned.runs.planned
+    run, free = planned.runs.planned, planned.runs.free
+    worst = sorted({int(gaps.argmin()) for gaps in free.gaps.T if gaps.min() < 0})
     centre, instants = _shown(run.body)
     low, high = run.body.min(axis=(0, 1)), run.body.max(axis=(0, 1))
     room = 0.1 * (high - low).max()
@@ -94,10 +95,11 @@ def figure_views(planned: PlannedControl, picture: PictureMesh, out_png: Path) -
         for ax, plane in zip(views, ((0, 2), (0, 1)), strict=True):
             for i in range(len(planned.names)):
                 _draw(ax, planned, i, run.times[instants], plane, box[:, plane])
+            for n in worst:
+                ax.plot(*_outline(free.body[n][:, plane]).T, color="#888888", lw=0.9, ls=(0, (4, 2)), zorder=2)
             for colour, n in zip(colours, instants, strict=True):
                 seen = run.body[n][:, plane]
-                around = seen[ConvexHull(seen).vertices]
-                ax.plot(*np.vstack([around, around[:1]]).T, color=colour, lw=1.3, zorder=3)
+                ax.plot(*_outline(seen).T, color=colour, lw=1.3, zorder=3)
                 _dots(ax, planned, seen, colour)
                 x, y = centre[n][list(plane)]
                 ax.text(
@@ -107,6 +109,12 @@ def figure_views(planned: PlannedControl, picture: PictureMesh, out_png: Path) -
             ax.set(xlim=box[:, plane[0]], ylim=box[:, plane[1]], aspect="equal", ylabel=f"${AXES[plane[1]]}$ [m]")
         views[-1].set_xlabel("$x$ [m]")
         return style.save(figure, out_png)
+
+
+def _outline(points: Array) -> Array:
+    """Corners of the hull of points in the plane, the first one again at the end."""
+    around = points[ConvexHull(points).vertices]
+    return np.vstack([around, around[:1]])
 
 
 def _dots(ax: Any, planned: PlannedControl, body: Array, colour: Any) -> None:
@@ -223,7 +231,7 @@ def figure_gaps(planned: PlannedControl, out_png: Path) -> tuple[Path, ...]:
                 ax.axhline(level, **LIMIT)
                 ax.axhline(-level, **LIMIT)
         turns = task.angle is not None
-        force.set_ylabel("force on the hand [N" + (", N m]" if turns else "]"))
-        speed.set(xlabel="$t$ [s]", ylabel="speed of the hand [m/s" + (", rad/s]" if turns else "]"))
-        force.legend(ncols=2, loc="upper right")
+        force.set_ylabel("load [N, N m]" if turns else "force on the hand [N]")
+        speed.set(xlabel="$t$ [s]", ylabel="speed [m/s, rad/s]" if turns else "speed of the hand [m/s]")
+        force.legend(ncols=3, loc="upper right")
         return style.save(figure, out_png)
