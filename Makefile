@@ -2,6 +2,8 @@
 
 export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
+# Where it is set, each start of Python compiles every module anew, in each of the many programs of the tests.
+unexport PYTHONDONTWRITEBYTECODE
 
 BIN := .venv/bin
 STAMP := .venv/.stamp

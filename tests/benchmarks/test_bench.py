@@ -185,8 +185,7 @@ def test_driver_gets_numbers_from_two_ranks(monkeypatch: pytest.MonkeyPatch) -> 
     assert "error" not in result, result
     assert result["points"][0]["ranks"] == 2
     assert "ts" in result["points"][0]["step_us"]
-    for ranks in (1, 2):
-        assert "ZeroDivisionError" in launch_worker("forward", spec | {"dimension": 0}, ranks)["error"]
+    assert "ZeroDivisionError" in launch_worker("forward", spec | {"dimension": 0}, 2)["error"]
 
 
 @pytest.mark.parametrize("text", ["4d:100", "2d:many", "2d:3", ""])

@@ -106,6 +106,7 @@ def noisy(*_: str) -> float:
     return max(0.0, -float(task.gaps(task.places + run.moved, run.times).min()))
 
 
+FOUND = "the same with a horizon that is found"  # ten seconds, not in the quick half
 PLANS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("wall 5 cm behind the target", (f"obstacle=[{WALL}]",), 0.0),
     ("two equal walls", (f"obstacle=[{WALL}, {WALL}]",), 0.0),
@@ -151,14 +152,14 @@ PLANS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
         "obstacle=[{kind='disc', center=[0.5, -1.5], radius=0.7, path={velocity=[0, 3]}}]",), 1.157),
     ("slit of two discs, a micrometre narrower than body and margins", (slit(0.999e-3), *UPWARDS), None),
     ("slit of two discs, a micrometre wider", (slit(1.001e-3), *UPWARDS), 0.0),
-    ("the same with a horizon that is found", (slit(1.001e-3), *UPWARDS[:2]), 0.0),
+    (FOUND, (slit(1.001e-3), *UPWARDS[:2]), 0.0),
 )  # fmt: skip
 
 
 def plan_rows(quick: bool) -> Iterator[HardCase]:
     """Plans with little room, and scenes that have none."""
     for number, (name, changes, bound) in enumerate(PLANS):
-        if quick and number % 2:
+        if quick and (number % 2 or name == FOUND):
             continue
         reason = (
             "every gap is kept at every step"

@@ -134,7 +134,7 @@ def test_another_step_of_the_same_motion_is_inside_the_box(own: FullRun, trained
 
 PLACES = {"paper_forward": (1.6, 0.9), "block_3d": (1.5, 1.1)}  # shares of lambda and mu inside the box below
 IN_3D = ("tissue.cells=[3, 2, 4]", "tissue.order=2", "tissue.refine.passes=0", "effects.rotation=false",
-         "motion.target=[0.2, 0.1, 0.3]", "time.steps=100", "effects.finite_strain={}")  # fmt: skip
+         "motion.target=[0.2, 0.1, 0.3]", "time.steps=50", "effects.finite_strain={}")  # fmt: skip
 
 
 @pytest.mark.serial

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -113,8 +114,12 @@ def check(comm: MPI.Intracomm, case: Case, folder: Path) -> dict[str, float]:
     return {"asked": case.tolerance, "told": point.error, "true": error, "reference": truth.error}
 
 
+def slow(case: Case) -> Any:
+    return pytest.param(case, marks=pytest.mark.slow)
+
+
 @pytest.mark.usefixtures("_few_samples")
-@pytest.mark.parametrize("case", [*SMALL[:2], pytest.param(SMALL[2], marks=pytest.mark.slow)], ids=lambda c: c.scene)
+@pytest.mark.parametrize("case", [slow(SMALL[0]), SMALL[1], slow(SMALL[2])], ids=lambda c: c.scene)
 def test_tolerance_holds_on_small_scenes(comm: MPI.Intracomm, mpi_tmp_path: Path, case: Case) -> None:
     check(comm, case, mpi_tmp_path)
 
