@@ -23,7 +23,7 @@ def grown(ranks: int = 1, factor: int = 4) -> ScaleCost:
     return replace(ROW, n_e=10_000, ranks=ranks, seconds=dict.fromkeys(STAGES, float(factor)), memory_mb=2100.0)
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 def test_a_row_is_a_run_of_its_size(comm: MPI.Intracomm) -> None:
     (row,) = measure_row(kind="3D P2", size=600, solver="stars")
     assert (row.kind, row.ranks, row.solver) == ("3D P2", comm.size, "stars")

@@ -52,18 +52,17 @@ def test_dependent_rows_are_solved_to_the_tolerance(engine: str) -> None:
         assert abs(x @ (W @ x + q)) < 1e-10 * abs(x).sum()  # so x is the least of x'W x / 2 + q'x
 
 
-@pytest.mark.ranks(3)
 @pytest.mark.parametrize(
     "overrides",
     [
         [table(3)],
-        [table(5), BETA, *TWO],
-        [table(3), "tissue.order=2", BETA],
+        pytest.param([table(5), BETA, *TWO], marks=pytest.mark.ranks),
+        pytest.param([table(3), "tissue.order=2", BETA], marks=pytest.mark.ranks),
         [table(4), "tissue.order=3", "tissue.cells=[2, 4]"],
         [table(3, ", {kind='halfspace', normal=[0.1, 1], offset=-0.02}"), BETA],
         [PIN, BETA],
         [PIN, *TWO],
-        [WEDGE, BETA],
+        pytest.param([WEDGE, BETA], marks=pytest.mark.ranks),
     ],
 )
 def test_balance_closes_without_penetration_at_points(overrides: list[str]) -> None:

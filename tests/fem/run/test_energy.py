@@ -32,6 +32,7 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.ranks(kind=("damped", "two-way", "finite strain", "contact"))
 @pytest.mark.parametrize("kind", KINDS)
 def test_energy_is_that_of_the_states(kind: str, comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     """By the step's own sum of potential and momentum at every frame; those of linear steps by K and M too."""

@@ -55,7 +55,7 @@ def pushed(
     return run, led(one, run), np.array(u)
 
 
-@pytest.mark.ranks(rotation=True)
+@pytest.mark.ranks(rotation=True, name=("equilibrium", "layers", "p2", "3d, dragged, weighing"))
 @pytest.mark.parametrize("rotation", [False, True])
 @pytest.mark.parametrize("name", CASES)
 def test_a_motion_takes_the_force_that_made_it(comm: MPI.Intracomm, name: str, rotation: bool) -> None:

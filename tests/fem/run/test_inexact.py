@@ -141,7 +141,7 @@ def test_finite_strain_steps_with_stars(comm: MPI.Intracomm) -> None:
     assert apart(run, exact) < 1e-7  # finite_strain.tol is 1e-9 a step; measured 1e-9
 
 
-@pytest.mark.ranks
+@pytest.mark.ranks(2)
 def test_an_iterated_equilibrium_says_how_far_it_is(comm: MPI.Intracomm) -> None:
     few = [*SILICONE, *FEW, "time.steps=2", "tissue.cells=[3,2,4]", "time.solver=stars"]
     shares: list[float] = []

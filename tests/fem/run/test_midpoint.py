@@ -83,7 +83,7 @@ def monolithic(model: Model, held: Any = held_by_paper) -> tuple[FirstOrder, Arr
     return full, full.run(at_rest(model), model.scene.time_end / model.scene.time.steps, loads)
 
 
-@pytest.mark.ranks(reaction=True, rotation=True)
+@pytest.mark.ranks(reaction=True, rotation=True, name=("bare", "equilibrium", "layers-dragged", "p2"))
 @pytest.mark.parametrize("rotation", [False, True])
 @pytest.mark.parametrize("reaction", [False, True])
 @pytest.mark.parametrize("name", CASES)
@@ -323,7 +323,7 @@ def pulse(n: int, t: float, q: Array, v: Array) -> Array:
     return wave(n, t, q, v) if t < 1.0 else np.zeros_like(q)
 
 
-@pytest.mark.ranks(force=pulse)
+@pytest.mark.ranks(force=pulse, changes=([LAYERED, {"effects": VISCOUS}], [CUBE]))
 @pytest.mark.parametrize(
     "changes",
     [[], [{"effects": VISCOUS}], [{"effects": RAYLEIGH}], [LAYERED, {"effects": VISCOUS}], [CUBE]],
