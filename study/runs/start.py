@@ -11,6 +11,7 @@ import numpy as np
 
 from softgrasp.fem import LIBRARY, SceneError, load_scene, scene_schema
 from softgrasp.fem.errors import MeshError
+from softgrasp.study.forward.cautions import STIFF
 from softgrasp.study.report import Table
 
 if TYPE_CHECKING:
@@ -85,6 +86,8 @@ def new_scene(file: Path, *, solid: bool = False, mesh: Path | None = None) -> l
         lower, upper, tip = points.min(axis=0), points.max(axis=0), points[points[:, -1].argmin()]
         tissue = _mesh_lines(mesh, file, scale, float(np.ptp(arrays.points, axis=0).max())) + repair
         sides, layers = _facet_line(arrays), _layer_tables(arrays)
+        nu = max((LIBRARY[name].poisson for name in _layer_materials(arrays).values()), default=0.0)
+        tissue += f"\norder = 2 # linear elements lock at a Poisson's ratio of {nu:g}" if nu > STIFF else ""
     d, body = len(upper), f"The body of {mesh.name}" if mesh else f"A {'block' if solid else 'strip'} of muscle"
     top = np.append(lower[:-1], upper[-1] - (0.1 if mesh else 0.25) * (upper[-1] - lower[-1]))
     text = SCENE.format(
@@ -132,16 +135,21 @@ def _facet_line(arrays: MeshArrays) -> str:
 
 def _layer_tables(arrays: MeshArrays) -> str:
     """A layer for each group of cells if there are two or more, with the material of its name or of the whole."""
-    groups = _groups(arrays.known["cell_sets"])
-    if len(groups) < 2:
-        return ""
-    tables = []
-    for name in groups:
+    materials, tables = _layer_materials(arrays), []
+    for name in materials:
         key = name if isinstance(name, str) else f"tag{name}"
         key = "tissue_group" if key == "tissue" else key  # that name is of the cells outside of all layers
-        material = str(name).lower() if str(name).lower() in LIBRARY else "muscle"
-        tables.append(f'\n[tissue.layers.{json.dumps(key)}]\ntag = {json.dumps(name)}\nmaterial = "{material}"\n')
+        tables.append(
+            f'\n[tissue.layers.{json.dumps(key)}]\ntag = {json.dumps(name)}\nmaterial = "{materials[name]}"\n'
+        )
     return "".join(tables)
+
+
+def _layer_materials(arrays: MeshArrays) -> dict[str | int, str]:
+    """Material of each group of cells: that of its name, or of the whole; none where there are not two groups."""
+    groups = _groups(arrays.known["cell_sets"])
+    known = {name: str(name).lower() if str(name).lower() in LIBRARY else "muscle" for name in groups}
+    return known if len(known) > 1 else {}
 
 
 def _groups(sets: Sets) -> Sets:

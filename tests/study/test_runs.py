@@ -203,7 +203,8 @@ def test_a_new_scene_turns_inverted_cells_round(tmp_path: Path) -> None:
 @pytest.mark.serial
 @pytest.mark.parametrize("unit", [1.0, 1e3])
 def test_a_new_scene_reads_the_groups_of_a_mesh(tmp_path: Path, unit: float) -> None:
-    """A strip of 4 cm by 8 cm: muscle below, tissue above, a grip on top and a floor; in metres or millimetres."""
+    """A strip of 4 cm by 8 cm: muscle or rubber below, tissue above, a grip on top and a floor; in m or mm."""
+    below, order = ("muscle", 1) if unit == 1.0 else ("ecoflex-00-30", 2)  # nu = 0.49, where linear elements lock
     x, y = np.meshgrid(np.linspace(0, 0.04, 5), np.linspace(0, 0.08, 9))
     corner = np.arange(40).reshape(8, 5)[:, :4].ravel()
     cells = np.vstack([np.c_[corner, corner + 1, corner + 6], np.c_[corner, corner + 6, corner + 5]])
@@ -213,7 +214,7 @@ def test_a_new_scene_reads_the_groups_of_a_mesh(tmp_path: Path, unit: float) -> 
         unit * np.c_[x.ravel(), y.ravel(), 0 * x.ravel()],
         [("triangle", cells[tags == 1]), ("triangle", cells[tags == 2]), ("line", low), ("line", low + 40)],
         cell_data={"gmsh:physical": numbers, "gmsh:geometrical": numbers},
-        field_data={"muscle": np.array([1, 2]), "tissue": np.array([2, 2])}
+        field_data={below: np.array([1, 2]), "tissue": np.array([2, 2])}
         | {"floor": np.array([3, 1]), "grip": np.array([4, 1])},
     )
     (tmp_path / "meshes").mkdir()
@@ -225,11 +226,12 @@ def test_a_new_scene_reads_the_groups_of_a_mesh(tmp_path: Path, unit: float) -> 
     assert scene.contact.facet_tag == "grip"
     assert '# other groups: "floor"; or sides and box' in file.read_text()
     layers = {name: layer.tag for name, layer in scene.tissue.layers.items()}
-    assert layers == {"muscle": "muscle", "tissue_group": "tissue"}  # a layer may not be called tissue
+    assert layers == {below: below, "tissue_group": "tissue"}  # a layer may not be called tissue
     assert scene.tissue.scale == (1.0 if unit == 1.0 else 1e-3)
+    assert scene.tissue.order == order
     model = sg.build(scene)
     held = model.system.layout.held
-    assert held.shape == (5, 2)
+    assert held.shape == (4 * order + 1, 2)
     assert np.allclose(held[:, 1], 0.08, atol=1e-9)  # in metres, whatever the file's unit; numbers of text
     assert len(model.system.layers) == 2  # nothing is outside of both
 
