@@ -80,8 +80,8 @@ def test_of_second_order_beside_the_own_two_way_model(rom: TurningModel) -> None
     assert np.all(np.abs(orders - 2) < 0.1), (errors, orders)
 
 
-def test_a_free_body_with_tissue_keeps_what_a_rigid_one_keeps() -> None:
-    """MuJoCo's explicit gyroscopic forces are of first order; over several starts tissue hardly adds to them."""
+def test_a_free_body_with_tissue_keeps_more_than_a_rigid_one() -> None:
+    """MuJoCo's explicit gyroscopic forces lose momenta in first order; those of the tissue are given back."""
     rom, h, rng, drifts = reduced({"damping": False}, 24), 1e-3, np.random.default_rng(0), []
     small = rom.at(h)
     M = rom.M_hand + small.rigid
@@ -108,12 +108,16 @@ def test_a_free_body_with_tissue_keeps_what_a_rigid_one_keeps() -> None:
                     P, L = Sums.of(row, 6).momenta(M, xi).reshape(2, 3) @ Q.T
                     kept.append([P, L + np.cross(at.xpos[tissue.body], P)])
             drift.append(np.ptp(kept, axis=0).max(axis=1) / np.linalg.norm(kept[0], axis=1))
-            assert alone or np.abs(tissue.a).max() > 0
-        assert drift[1][0] < 5e-4
         drifts.append(drift)
-    rigid, soft = np.sum(drifts, axis=0)  # changes of the linear and of the angular momentum
-    # swinging tissue adds 4e-7 of the momentum, which does not grow in time: 0.8 and 0.6 % of a flight of 0.75 s
-    assert soft / rigid == pytest.approx([1.0, 1.0], abs=0.015)
+        assert np.abs(tissue.a).max() > 0
+        data.qvel[:3] += 1.0  # by the user: not to be given back
+        before = data.qvel[:3].copy()
+        tissue.step(data)
+        assert np.abs(data.qvel[:3] - before).max() < 0.05
+    rigid, soft = np.array(drifts).transpose(1, 0, 2)  # changes of the linear and of the angular momentum
+    assert np.all(soft < rigid)
+    # the hand spins about its centre, so that it loses no linear momentum; of the angular one it loses its share
+    assert np.all(soft.sum(axis=0) < [0.02, 0.25] * rigid.sum(axis=0))  # measured 0.009 and 0.17
 
 
 def test_the_compiled_step_is_that_in_numpy(rom: TurningModel) -> None:
