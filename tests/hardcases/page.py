@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -125,6 +126,7 @@ SMALLEST = 1e-17  # smaller numbers, and zero, are drawn here
 LARGEST = 1e12  # larger numbers are drawn as none
 GAP = 0.6  # [decades] around the numbers
 BESIDE = 42  # [letters] of a failure that fit beside the frame
+LABEL = 34  # [letters] of a line of the name of a case
 SIZE = 4.5  # of a mark
 
 
@@ -243,13 +245,13 @@ def _listed(family: Family, rows: Sequence[HardCase]) -> Any:
             missing = math.isnan(place)
             ax.plot(high + 0.05 * span if missing else place, i + shift, marker, color=colour, ms=SIZE, clip_on=False)
             if missing:
-                word = "refused" if outcome.refused else outcome.text[:BESIDE]
+                word = "refused" if outcome.refused else textwrap.shorten(outcome.text, BESIDE, placeholder=" ...")
                 ax.text(high + 0.08 * span, i + shift, word, color=colour, fontsize=6.5, va="center")
-    ax.set_yticks(range(len(rows)), [row.case for row in rows])
+    ax.set_yticks(range(len(rows)), [textwrap.fill(row.case, LABEL) for row in rows])
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.set_xlim(low, high + 0.62 * span)
     if scaled:
-        powers = _ticks(low, high, 8)
+        powers = _ticks(low, high, 5)
         ax.set_xticks(powers, [f"$10^{{{p}}}$" for p in powers])
     else:
         ax.set_xticks([t for t in MaxNLocator(6).tick_values(0, high) if 0 <= t <= high])
