@@ -267,7 +267,7 @@ def rank_rows(quick: bool) -> Iterator[HardCase]:
 
 
 FAMILIES = (
-    Family("numbers", "NaN and infinity in every numeric key", "place", "bad values taken", "type check alone",
+    Family("numbers", "NaN and infinity in every numeric key", "place", "bad values accepted", "type check alone",
            "NaN is a float to TOML and to every type check; each key has to ask for a finite number.", number_rows,
            axis="listed"),
     Family("exclusive", "Effects and keys that exclude each other", "pair", "must be refused", "the JSON schema",

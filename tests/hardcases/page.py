@@ -216,7 +216,7 @@ def _curves(family: Family, rows: Sequence[HardCase]) -> Any:
     span = max(at.values()) - min(at.values()) or 1.0
     ax.set_xlim(min(at.values()) - 0.06 * span, max(at.values()) + 0.06 * span)
     ax.set_xlabel(family.varied)
-    ax.set_ylabel(family.quantity)
+    ax.set_ylabel(textwrap.fill(family.quantity, LABEL))
     shown = sorted(marks, key=lambda name: (name == "bound", not name.startswith("here")))
     figure.legend(
         [marks[n] for n in shown], shown, loc="outside upper left", ncols=2, handlelength=1.6, columnspacing=1.2
