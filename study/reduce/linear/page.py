@@ -30,7 +30,8 @@ CAPTIONS = {
     "errors.png": "Error of the deformation against N, all columns of V counted, of the paper's six methods and of "
     "Craig-Bampton and PSD SVD-like where they ran. A curve "
     "is dotted where its model is unstable (crosses). Errors above 100 % are drawn at 100 %.",
-    "errors_beyond.png": "The same for the methods beyond the paper, beside its best.",
+    "errors_beyond.png": "Error of the deformation against N of the methods beyond the paper, beside the best of the "
+    "paper's that ran. A curve is dotted where its model is unstable.",
     "errors_state.png": "Further errors of the paper's six methods: of the state [q_s, v_s, q_e, v_e], which is the "
     "paper's, of [q_s, p_s, q_e, p_e], and of the energy of the tissue.",
     "times.png": "Error of the deformation of all stable models against the time of a run, and against offline plus "
@@ -59,7 +60,7 @@ def compose(study: ReductionStudy, drawn: Sequence[Path], models: Sequence[Path]
         Section("Findings", text="\n\n".join(study.findings), terminal=True),
         time_table(study).section(details="\n\n".join(study.speed_notes), terminal=True),
         *([refused.section(terminal=True)] if refused.rows else []),
-        *box_sections(study.box),
+        *box_sections(study.box, scene.effects.damping is not None),
         Section("Pictures", figures=[(file, text) for file, text in figures if file.name not in FIRST]),
     ]
     tables, files = {"points.csv": point_table(study)}, [*drawn, *models]
@@ -164,7 +165,7 @@ def box_note(box: DomainTests) -> str:
     tests, (lam, mu) = sum(not p.trained for p in box.points), box.ranges
     text = (
         f"Deformation error at the scene's own parameter, and median and largest over {tests} others with lambda in "
-        f"[{lam[0]:g}, {lam[1]:g}] and mu in [{mu[0]:g}, {mu[1]:g}]."
+        f"[{lam[0]:.3g}, {lam[1]:.3g}] and mu in [{mu[0]:.3g}, {mu[1]:.3g}] Pa."
     )
     if not box.trained_at:
         return f"{text} Bases: from the scene's run; set reduction.train to train them by more."
@@ -193,11 +194,12 @@ def point_table(study: ReductionStudy) -> Table:
     return Table(("method", *names), [(s.method.key, *astuple(p)) for s in study.sweeps for p in s.points])
 
 
-def box_sections(box: DomainTests) -> list[Section]:
+def box_sections(box: DomainTests, damped: bool) -> list[Section]:
     """Errors at other parameters: a summary, and one table for each N with a column for each basis."""
     if box.none:
         return [Section("Other parameters", f"No tests at other parameters: {box.none}.", terminal=True)]
-    text = "Undamped vibrations of slightly wrong frequency drift out of phase, so errors grow with the run."
+    text = "Vibrations of slightly wrong frequency drift out of phase, so errors grow with the run"
+    text += " until damping has ended them." if damped else "."
     parts = [box_table(box).section(box_note(box), details=text, terminal=True)]
     for N in sorted({m.model.N for m in box.models}):
         shown = [(i, m) for i, m in enumerate(box.models) if m.model.N == N]

@@ -6,10 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS
-from softgrasp.study.reduce.linear.measure import FURTHER, chosen_methods
+from softgrasp.study.reduce.linear.measure import FURTHER, chosen_methods, speed_notes
 from softgrasp.study.reduce.linear.page import error_table, findings, least_size, stability
 from softgrasp.study.reduce.linear.plots import best_beyond
 from softgrasp.study.reduce.linear.result import MethodSweep, Point, best, kept_points, nearest
+from softgrasp.study.reduce.times import FullTimes
 from softgrasp.study.report.document import cell_text
 from tests.helpers.models import make_scene
 
@@ -40,6 +41,12 @@ def test_choice_of_points() -> None:
     assert least_size(points, 1e-6) is None  # an unstable model does not count
     assert stability(swept_of("psd", *points)) == "not 14"
     assert nearest([]) is None
+
+
+def test_times_of_the_paper_stand_beside_runs_of_its_size_only() -> None:
+    swept, full = [swept_of("psd", point(14, 0.1))], FullTimes(0.1, 0.2)
+    assert "a speed-up of 167; here the same comparison" in speed_notes(956, 600, full, swept)[-1]
+    assert [len(speed_notes(*sizes, full, swept)) for sizes in ((956, 600), (956, 300), (36, 600))] == [3, 2, 2]
 
 
 def swept_of(key: str, *points: Point) -> MethodSweep:
