@@ -87,6 +87,13 @@ def listed(names: Iterable[str], most: int = 6) -> str:
     return ", ".join(shown) or "none"
 
 
+def length_unit(largest: float) -> tuple[float, str]:
+    """Factor and name of the unit in which a length in metres reads well."""
+    if largest >= 0.1 or largest == 0.0:
+        return 1.0, "m"
+    return (1e3, "mm") if largest >= 1e-4 else (1e6, "µm")
+
+
 def percent(share: float, sign: str = "") -> str:
     """A share as a percentage of two digits, "+" with its sign, below 0.0001 % as a number.
 

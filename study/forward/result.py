@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem import Columns, Model, PETSc, Scene, Trajectory, counted, hand_columns, make_outputs, placed
+from softgrasp.fem import (
+    Columns,
+    Model,
+    PETSc,
+    Scene,
+    Trajectory,
+    counted,
+    hand_columns,
+    length_unit,
+    make_outputs,
+    placed,
+)
 from softgrasp.study.report import Table
 from softgrasp.study.report.origin import origin, peak_memory_mb
 
@@ -138,10 +149,12 @@ class Simulation:
         texts = [f"At t = {run.times[-1]:.4g} s the hand is at {placed(run.q_s[-1], self.hand(), 4)}."]
         if len(lag):
             i = int(lag.argmax())
+            unit = run.columns[i].unit
+            factor, unit = length_unit(lag[i]) if unit == "m" else (1.0, unit)
+            last = abs(run.outputs[-1, i] - run.outputs_rigid[-1, i])
             texts.append(
-                f"The output {run.columns[i].label} deviates from the rigid motion of the hand by up to {lag[i]:.3g} "
-                f"{run.columns[i].unit} and by {abs(run.outputs[-1, i] - run.outputs_rigid[-1, i]):.3g} "
-                f"{run.columns[i].unit} at the end."
+                f"The output {run.columns[i].label} deviates from the rigid motion of the hand by up to "
+                f"{factor * lag[i]:.3g} {unit} and by {factor * last:.3g} {unit} at the end."
             )
         texts.append(
             f"The {run.steps_timed} steps of {sizes.n_e} unknowns took {run.seconds['steps']:.3g} s; the energy "

@@ -37,6 +37,7 @@ COLUMN, WIDTH = 3.4, 7.0  # [inch], one column and both of a two-column page
 FULL: dict[str, Any] = {"color": "#888888", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}  # a full run beside reduced ones
 DPI = 150
 STEPS = [1, 2, 5, 10]  # between ticks
+MANY = 300  # last over first number of a logarithmic axis: beyond it powers of ten alone have numbers
 MARGIN = 0.04  # around a picture [inch]
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -66,7 +67,7 @@ def colour_map() -> Any:
 def few_ticks(axis: Any) -> None:
     """Numbers on a logarithmic axis that do not touch: powers of ten, and 2 and 5 between few of them."""
     low, high = sorted(axis.get_view_interval())
-    few = high / low < 300
+    few = high / low < MANY
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=7))
     if few and low >= 1e-3 and high < 1e5:
         axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
@@ -74,8 +75,11 @@ def few_ticks(axis: Any) -> None:
 
 
 def percent_ticks(axis: Any) -> None:
-    """Few numbers on a logarithmic axis of shares, as percentages."""
+    """Few numbers on a logarithmic axis of shares, as percentages; those of a horizontal one need room."""
     few_ticks(axis)
+    low, high = sorted(axis.get_view_interval())
+    if axis.axis_name == "x" and high / low >= MANY:
+        axis.set_major_locator(LogLocator(numticks=5))
     axis.set_major_formatter(FuncFormatter(lambda x, _: percent(x)))
 
 
@@ -167,13 +171,6 @@ def save(figure: Any, out_png: Path) -> tuple[Path, ...]:
             figure.savefig(file)
     plt.close(figure)
     return files
-
-
-def length_unit(largest: float) -> tuple[float, str]:
-    """Factor and name of the unit in which a length in metres reads well."""
-    if largest >= 0.1 or largest == 0.0:
-        return 1.0, "m"
-    return (1e3, "mm") if largest >= 1e-4 else (1e6, "µm")
 
 
 def pressure_unit(largest: float) -> tuple[float, str]:

@@ -12,7 +12,7 @@ import numpy as np
 from softgrasp.fem import Array, Trajectory, hand_columns, placed
 from softgrasp.fem.columns import hand_of, label_unit
 from softgrasp.reduction import Certificate, CertifiedModel, Materials, ReducedTrajectory
-from softgrasp.study.report import Table, percent
+from softgrasp.study.report import Share, Table, percent
 
 
 @dataclass(frozen=True)
@@ -141,8 +141,9 @@ def _row(answer: CertifiedAnswer, count: int) -> list[Any]:
     first, c = answer.materials[0], answer.certificate
     estimate = None if c.estimate is None else c.estimate.relative
     mesh = None if c.mesh is None else c.mesh.largest
-    row: list[Any] = [first.lam, first.mu, first.rho, answer.source, c.inside, c.reduction]
-    row += ["proof" if c.proved else "estimate", estimate, c.time_step, mesh]
+    reduction, *others = (None if x is None else Share(x) for x in (c.reduction, estimate, c.time_step, mesh))
+    row: list[Any] = [first.lam, first.mu, first.rho, answer.source, c.inside, reduction]
+    row += ["proof" if c.proved else "estimate", *others]
     return [*row, *([None] * (3 * count) if answer.run is None else (x for out in answer.outputs() for x in out[1:4]))]
 
 

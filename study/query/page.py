@@ -108,11 +108,12 @@ def _summary(answer: CertifiedAnswer, seconds: float) -> list[str]:
 def _summary_batch(answers: QueryResult) -> list[str]:
     refused, full, outside = answers.counts
     worst = answers.each[answers.worst[0]]
-    where = f"Outside the box of the training: {outside}; the bound is valid there too."
+    count = len(answers.each)
+    others = (f"; the full model answers {full}" if full else "") + (f"; {refused} are refused" if refused else "")
     return [
         f"The largest error of the reduction {worst.certificate.claim(percent(worst.certificate.reduction))}, "
         f"at {worst.parameters}.",
-        f"The reduced model answers {len(answers.each) - refused - full} of {len(answers.each)} materials, in "
-        f"{1e3 * answers.seconds:.3g} ms; the full model answers {full}, {refused} are refused.",
-        *([where] if outside else []),
+        f"The reduced model answers {count - refused - full} of {count} materials, in {1e3 * answers.seconds:.3g} ms"
+        f"{others}.",
+        *([f"{outside} of {count} materials lie outside the box of the training."] if outside else []),
     ]
