@@ -15,6 +15,7 @@ import numpy as np
 from cycler import cycler
 from PIL import Image
 
+from softgrasp.fem import length_unit as length_unit  # beside the other units
 from softgrasp.fem import note, percent
 from softgrasp.study.pictures.pdf import PDF
 
