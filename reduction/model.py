@@ -178,7 +178,7 @@ class ReducedModel(Shown):
             # the common factor enters squared at most: more than rounding apart is another mass distribution
             if max(ratios) - min(ratios) > 1e-12 * scale:
                 raise ModelError(
-                    "a canonical model contains M_ee^-1 and accepts densities that all change by one factor;  "
+                    "a canonical model contains M_ee^-1 and accepts densities that all change by one factor; "
                     "project again, or use a (q, v) model"
                 )
         g = self.gravity if gravity is None else np.asarray(gravity, dtype=float)

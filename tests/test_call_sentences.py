@@ -25,22 +25,32 @@ from softgrasp.fem.fields import vtu
 from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.simulate import Run
 from softgrasp.fem.scene.table import read_csv
+from softgrasp.fem.solve.cholesky import Dissection
 from softgrasp.fem.strain import compiled
 from softgrasp.lqr.dense import care
+from softgrasp.lqr.design import controller as controllers
+from softgrasp.lqr.design import feedback
 from softgrasp.lqr.loop import touching
 from softgrasp.lqr.loop.actuation import Actuation
+from softgrasp.lqr.lowrank import adjoint, compress
+from softgrasp.lqr.lowrank.shifted import DistributedTissue
+from softgrasp.lqr.observer import judge
 from softgrasp.lqr.observer.full import full_filter
 from softgrasp.lqr.observer.reduced import reduced_filter
 from softgrasp.lqr.plant.second_order import second_order
 from softgrasp.lqr.plant.target import hand_target
 from softgrasp.lqr.program.least_distance import nearest
-from softgrasp.reduction.archive import read_reconstruction
+from softgrasp.lqr.spectrum.sampled import Sampling
+from softgrasp.reduction.archive import load, read_reconstruction
 from softgrasp.reduction.bases.plugins import displacement_method
+from softgrasp.reduction.bases.states import _check
 from softgrasp.reduction.bases.truncation import Part, Truncation, counts_of
 from softgrasp.reduction.bridges import mujoco
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.contact.replay import errors_contact
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import run as run_online
+from softgrasp.reduction.strain.model import ReducedStrainSystem, StrainModel
 from softgrasp.reduction.strain.training import Training
 from softgrasp.study.query.request import read_batch
 from softgrasp.study.query.run import _full_model
@@ -208,6 +218,76 @@ def restored(*_: Any) -> None:
     Run.restore(run, saved)
 
 
+def other_model(key: str, value: str, **given: Any) -> Act:
+    """A file of a reduced model with another attribute, or for another scene."""
+
+    def act(folder: Path, _: Any) -> None:
+        sg.save(made()[2], folder / "a.h5")
+        if value:
+            with h5py.File(folder / "a.h5", "r+") as file:
+                file.attrs[key] = value
+        load(folder / "a.h5", **given)
+
+    return act
+
+
+def refused_by_lapack(module: Any, call: Callable[[], Any]) -> Act:
+    """A call whose LAPACK routine finds its arguments wrong."""
+    return patched(module.scipy.linalg, "get_lapack_funcs", lambda *_: (lambda *_, **__: (E, 1.0, -1),), call)
+
+
+def not_sorted(*_: Any, **__: Any) -> None:
+    raise np.linalg.LinAlgError("reordering failed")
+
+
+def sampled(*_: Any) -> None:
+    """A design whose loop grows from tick to tick, whatever its rate."""
+    ticks = SimpleNamespace(stable_rate=lambda *_: None)
+    gain_check = SimpleNamespace(law=Sampling(0.1, 1), ticks=ticks, K=E)
+    time_end = SimpleNamespace(scene=SimpleNamespace(time=SimpleNamespace(steps=4), time_end=1.0))
+    radius = SimpleNamespace(value=1.5)
+    design: Any = SimpleNamespace(gain_check=gain_check, quality=SimpleNamespace(sampled=radius), model=time_end)
+    design.largest_radius = 1.0
+    feedback._require_sampled(design)
+
+
+def unmixed(*_: Any) -> None:
+    """A canonical model of two layers, one of which is to be denser."""
+    one = made()[2].materials[0]
+    own: Any = SimpleNamespace(materials=(one, one), damped=False, coordinates="qp", gravity=None)
+    ReducedModel.parameters(own, (one, replace(one, rho=2.0)))
+
+
+def other_density(*_: Any) -> None:
+    one = made()[2].materials[0]
+    own: Any = SimpleNamespace(materials=(one,))
+    StrainModel.at(own, 0.1, (replace(one, rho=2.0),))
+
+
+def endless(*_: Any) -> None:
+    own: Any = SimpleNamespace(model=SimpleNamespace(G=np.zeros((1, 2))), problem=SimpleNamespace(dt=0.1))
+    ReducedStrainSystem.run(own, (np.full((3, 2), np.inf), np.zeros((3, 2))))
+
+
+def blind(_: Path, patch: pytest.MonkeyPatch) -> None:
+    """A controller where no gain of small order has passed."""
+    patch.setattr(controllers, "blind", lambda _: False)
+    layout = SimpleNamespace(n_local=4, n_s=2)
+    controllers._gain(SimpleNamespace(problem=SimpleNamespace(layout=layout), modal=False), None, None)  # type: ignore[arg-type]
+
+
+def patterns(*_: Any) -> None:
+    own: Any = SimpleNamespace(indptr=np.zeros(3), columns=np.zeros(2), comm=MPI.COMM_SELF)
+    DistributedTissue._values(own, matrix(E).convert("aij"))
+
+
+def dissected(*_: Any) -> None:
+    own: Any = SimpleNamespace(order=SimpleNamespace(d=1), before=(np.array([0, 9, 9]), np.zeros(1)))
+    Dissection.matrix(own, matrix(E).convert("aij"))
+
+
+WRONG_SHAPES: Any = SimpleNamespace(Z=np.zeros((3, 2)), q_s=np.zeros((2, 2)), v_s=np.zeros((2, 2)))
+ONE: Any = np.ones((1, 1))
 REFINED = ["tissue.refine={method='lines'}", "tissue.mesh='a.msh'", "tissue.size=false", "tissue.cells=false"]
 FRICTION = "obstacle=[{kind='halfspace', name='a', normal=[0, 1], offset=-1.0, friction=0.1, parts=2}]"
 TWICE = "control.outputs=[{kind='hand', name='a'}, {kind='hand', name='a'}]"
@@ -267,6 +347,31 @@ SENTENCES: list[tuple[Act, str]] = [
     (batch("mu\n"), "b.csv: it has no row of numbers below its first line"),
     (batch("mu\nx\n"), "b.csv: row 1: 'x' is not a number"),
     (batch("mu\n1e60\n"), "b.csv: row 1: give a finite number between 1e-50 and 1e50"),
+    (batch("mu\n" + 200_000 * "1"), "b.csv: field larger than field limit (131072)"),
+    (scene("'a$b'=1"), "is no key; a key has 1 to "),
+    (dissected, "the matrix does not have the pattern that was dissected"),
+    (other_model("format", "softgrasp 0"), "a.h5 is no reduced model of this version ("),
+    (other_model("", "", scene_hash="0" * 64), "a.h5 was made for another scene (hash "),
+    (lambda *_: _check(made()[0].system.layout, made()[0].system, WRONG_SHAPES), "snapshots have the shapes (3, 2), "),
+    (unmixed, "a canonical model contains M_ee^-1 and accepts densities that all change by one factor; "),
+    (other_density, "a model at finite strain keeps the densities it was made with; reduce the scene again"),
+    (endless, "the hand's tables contain numbers that are not finite"),
+    (lambda *_: care.riccati_schur(ONE, 0 * ONE, ONE), "the stable subspace of the Hamiltonian matrix gives no sol"),
+    (patched(care, "newton_polish", lambda A, G, H, X: (X, np.array([1.0 + 0j]), 1),
+             lambda: care.riccati_schur(ONE, ONE, ONE)), "the closed loop computed has the abscissa 1.0e+00, not be"),
+    (patched(care.scipy.linalg, "schur", not_sorted, lambda: care.riccati_schur(ONE, ONE, ONE)),
+     "the stable eigenvalues of the Hamiltonian matrix cannot be separated from the others (reordering failed): Q"),
+    (lambda *_: care.check_seen(0 * ONE, 0 * ONE, 0 * ONE, 0.0), "the reduced equation of order 1 has a solution by "),
+    (refused_by_lapack(care, lambda: care.lyapunov(E, E, E)), "the Lyapunov equation of order 2 was refused by LAPACK"),
+    (refused_by_lapack(judge, lambda: judge._covariance(E, E, E)), "the Lyapunov equation of order 2 was refused by "),
+    (patched(compress.scipy.linalg.lapack, "dpstrf", lambda *_, **__: (E, 0, 0, -3), lambda: compress._leading(E, 0.1)),
+     "the Gram matrix of order 2 was refused by LAPACK (info -3)"),
+    (lambda *_: adjoint._solve_small(0j * E, 0j * E), "a matrix of order 2 of the feedback or the hand is singular "),
+    (blind, "no a-priori gain of small order with tissue in it is certified to be stable"),
+    (sampled, "is unstable: its spectral radius from tick to tick is 1.5, which must be below 1; no rate makes it "),
+    (patterns, "mass, stiffness and damping have different sparsity patterns; assemble them on one"),
+    (lambda *_: sg.abscissa(SimpleNamespace(layout=SimpleNamespace(n_s=0)), SimpleNamespace(block=None)),  # type: ignore[arg-type]
+     "the certified abscissa belongs to a hand; without one use softgrasp.lqr.spectrum.modal_loop.ModalLoop"),
     (no_scene, "--fallback full: no scene.toml beside "),
     (outside, "the page needs more than itself: <script src=b"),
     (lambda *_: new_scene(Path("a.tml")), "a.tml: a scene is a TOML file; name it a.toml"),
