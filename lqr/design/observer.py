@@ -21,9 +21,11 @@ from softgrasp.lqr.observer.judge import Judged, Ticks, abscissa_without, judge,
 from softgrasp.lqr.observer.reduced import ReducedFilter, reduced_filter
 from softgrasp.lqr.observer.seen import Seen, seen_modes
 from softgrasp.lqr.observer.sensors import Noise, Sensors, make_disturbance, make_sensors
+from softgrasp.lqr.observer.tail import rest_of, why_no_rest
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, FEW, ModalLoop
+from softgrasp.lqr.spectrum.sampled import SAFE
 
 WEIGHTS = (1.0, 10.0, 100.0)  # of the noise that stands for what the filter leaves out, until the full loop is stable
 SWAPS = 3  # of modes, where the filter slows the loop
@@ -56,7 +58,7 @@ class ObservedControl:
     sd_full: Array | None
     """Standard deviation of the outputs, relative to the hand, by the full filter [m, rad], (o,)."""
     loop: ModalLoop
-    """All modes of the plant."""
+    """All modes of the plant; the lowest above :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT` unknowns."""
     ticks: Ticks
     """The full plant in them, from tick to tick."""
 
@@ -64,10 +66,16 @@ class ObservedControl:
 def require_observable(model: Model) -> None:
     """Raises ControlError: the scene has no observer, whatever its gain."""
     layout, control = model.system.layout, control_of(model)
-    if layout.n_e > DENSE_LIMIT:
+    needed = why_no_rest(model.system) if layout.n_e > DENSE_LIMIT else ""
+    if needed:
         raise ControlError(
-            f"an observer is checked with all modes of the plant, at most {DENSE_LIMIT}; this scene has {layout.n_e}: "
-            "use a coarser mesh"
+            f"above {DENSE_LIMIT} unknowns an observer is checked for {needed}; this scene has {layout.n_e}: use a "
+            "coarser mesh"
+        )
+    if layout.n_e > DENSE_LIMIT and control.constraints is not None:
+        raise ControlError(
+            f"a plan with control.observer knows all modes of the plant, at most {DENSE_LIMIT}; this scene has "
+            f"{layout.n_e}: use a coarser mesh, or leave out control.observer or control.constraints"
         )
     if control.method == "modal":
         raise ControlError("an observer needs the optimal gain of the whole plant; leave out control.method = 'modal'")
@@ -104,7 +112,9 @@ def observe(design: Design, watch: Stopwatch) -> ObservedControl:
             except (ControlError, SolverError) as error:  # the filter that runs does without it
                 missing = str(error)
     with watch.stage("observer"):
-        loop = ModalLoop(problem, DENSE_LIMIT)
+        whole = problem.layout.n_e <= DENSE_LIMIT
+        loop = ModalLoop(problem, DENSE_LIMIT if whole else FEW)
+        rest = None if whole else rest_of(problem, loop, sensors, period)
         ticks = make_ticks(problem, loop, sensors, disturbance, period)
 
         def candidate(weight: float, kept: NDArray[np.int64] | None = None) -> _Candidate:
@@ -112,7 +122,7 @@ def observe(design: Design, watch: Stopwatch) -> ObservedControl:
                 problem, loop.plant, sensors, disturbance, given.N, period, given.delay, weight, kept
             )
             controller = _controller(design, reduced, period)
-            judged = judge(problem, design.solution, loop, ticks, disturbance, controller)
+            judged = judge(problem, design.solution, loop, ticks, disturbance, controller, rest)
             return _Candidate(weight, reduced, controller, judged)
 
         for weight in WEIGHTS:
@@ -120,9 +130,13 @@ def observe(design: Design, watch: Stopwatch) -> ObservedControl:
             if found.judged.stable:
                 break
         else:
+            small = found.judged.small_gain
+            why = f"abscissa {found.judged.abscissa:.3g}/s"
+            if found.judged.abscissa < 0:
+                why = f"small gain {small:.2g}, not below {SAFE:g}, with the modes that were left out"
             raise ControlError(
-                f"no observer of {given.N} states leaves the full plant stable, the last one has the abscissa "
-                f"{found.judged.abscissa:.3g}/s; raise control.observer.N, or lower control.Q for a slower loop"
+                f"no observer of {given.N} states leaves the full plant stable, the last one has the {why}; raise "
+                "control.observer.N, or lower control.Q for a slower loop"
             )
         if not found.judged.fast:
             found = _with_other_modes(problem, found, candidate, ticks)
@@ -159,7 +173,7 @@ def _with_other_modes(
             break
         every = [candidate(found.weight, np.append(np.delete(kept, i), slow)) for i in range(len(kept))]
         best = min(every, key=lambda other: other.judged.abscissa)
-        if best.judged.abscissa >= found.judged.abscissa:
+        if not best.judged.stable or best.judged.abscissa >= found.judged.abscissa:
             break
         found = best
     less = candidate(LESS * found.weight, found.reduced.kept)

@@ -1,7 +1,8 @@
 """Full plant, observer and gain from tick to tick: is the loop stable, and what is its cost?
 
 The reduced filter is stable on its own plant by design, which proves nothing for the modes that it leaves out. Here
-all modes are kept, so that the spectrum is that of the whole loop. With the exact step of a tick, x+ = A x + B u + w,
+all modes are kept, so that the spectrum is that of the whole loop, or of a large plant the lowest, with a bound on the
+rest, see :mod:`softgrasp.lqr.observer.tail`. With the exact step of a tick, x+ = A x + B u + w,
 s = C x + v,
 
     F = the map of [x; m; inputs and samples on their way] over a tick,   S = (F - I)(F + I)^{-1},
@@ -24,9 +25,11 @@ from softgrasp.lqr.loop.controller import Controller
 from softgrasp.lqr.loop.filter import Filter
 from softgrasp.lqr.lowrank.compress import gram
 from softgrasp.lqr.observer.sensors import Disturbance, Sensors
+from softgrasp.lqr.observer.tail import Rest
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
+from softgrasp.lqr.spectrum.sampled import SAFE
 
 FAST = 0.98  # of the pace with the state known
 TURN = 1.0  # of the fastest mode in a step of Simpson's rule at most [rad]; its error there is a few 1e-4
@@ -88,16 +91,17 @@ class Judged:
     sd_inputs: Array  # standard deviation of the inputs from those that were planned [N, N m], (n_s,)
     sd_error: Array  # standard deviation of the estimate of the outputs [m, rad], (o,)
     covariance: Array  # of the full state in modes, (n, n); empty where the loop is not stable
+    small_gain: float = 0.0  # of modes left out, below 1 where they leave the loop stable; 0 where all are kept
 
     @property
     def stable(self) -> bool:
-        """Whether every eigenvalue of the whole loop lies inside the unit circle."""
-        return self.abscissa < 0
+        """Whether every eigenvalue of the whole loop is known to lie inside the unit circle."""
+        return self.abscissa < 0 and self.small_gain < SAFE
 
     @property
     def fast(self) -> bool:
-        """Whether the loop is as fast as with the state known, within 2 %."""
-        return self.abscissa <= FAST * self.abscissa_known
+        """Whether the loop is stable and as fast as with the state known, within 2 %."""
+        return self.stable and self.abscissa <= FAST * self.abscissa_known
 
     @property
     def excess(self) -> float:
@@ -152,12 +156,14 @@ def judge(
     plant: Ticks,
     disturbance: Disturbance,
     controller: Controller,
+    rest: Rest | None = None,
 ) -> Judged:
     """A controller with observer on the full plant. Collective.
 
     Args:
         solution: optimal gain, and its X for the least cost.
-        loop: all modes, of which ``plant`` is the step.
+        loop: all modes, or the lowest, of which ``plant`` is the step.
+        rest: bound of the modes that are not among them.
     """
     known = loop.gain(solution.gain.block)
     least = float(np.sum(gram(problem.layout.comm, solution.factor, disturbance.factor) ** 2))
@@ -173,6 +179,10 @@ def judge(
         if not abscissa < 0:
             none, load = np.full(len(plant.y), np.inf), np.full(len(K), np.inf)
             return Judged(abscissa, best, np.inf, least, none, load, none, np.zeros((0, 0)))
+        small_gain = 0.0
+        if rest is not None:
+            enter, direct = map_.noise[:, -len(plant.sd) :] / plant.sd, K @ map_.direct / plant.sd
+            small_gain = rest.gain(map_.F, enter, K @ map_.estimate, direct)
         X = _covariance(T, U, np.sqrt(2.0) * inverse @ map_.noise)
         seen = np.hstack([plant.y, np.zeros((len(plant.y), len(X) - n))])
         error, at_once = seen - controller.plant.C @ map_.estimate, controller.plant.C @ map_.direct
@@ -180,7 +190,7 @@ def judge(
         inputs = u @ X @ u.T + (K @ map_.direct) @ (K @ map_.direct).T
         cost = float(np.sum(problem.Q * y) + np.sum(problem.R * inputs))
         sd_y, sd_u, sd_e = (np.sqrt(np.maximum(np.diag(part), 0.0)) for part in (y, inputs, e))
-        return Judged(abscissa, best, cost, least, sd_y, sd_u, sd_e, X[:n, :n])
+        return Judged(abscissa, best, cost, least, sd_y, sd_u, sd_e, X[:n, :n], small_gain)
 
     return on_root(problem.layout.comm, evaluate)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from softgrasp.fem.shown import counted, percent
 from softgrasp.lqr.observer.seen import STILL, Seen
+from softgrasp.lqr.spectrum.sampled import SAFE
 from softgrasp.study.control.observer.result import ObservedStudy
 from softgrasp.study.report.document import Section, in_words
 
@@ -59,10 +60,14 @@ def modes_section(seen: Seen) -> Section:
 
 def sentence(study: ObservedStudy) -> str:
     """What came out."""
-    judged, N = study.observed.judged, study.observed.reduced.plant.N
+    judged, N, loop = study.observed.judged, study.observed.reduced.plant.N, study.observed.loop
+    of = "" if loop.complete else f" of the lowest {len(loop.plant.omega)} modes"
+    proof = ""
+    if not loop.complete:
+        proof = f" The small gain of the other modes, {judged.small_gain:.2g}, is below {SAFE:g}: this is proved."
     return (
-        f"The full plant under the observer of {N} states is stable: its abscissa is {judged.abscissa:.4g} 1/s, with "
-        f"the state known {judged.abscissa_known:.4g} 1/s. With the disturbances the cost is "
+        f"The full plant under the observer of {N} states is stable: its abscissa{of} is {judged.abscissa:.4g} 1/s, "
+        f"with the state known {judged.abscissa_known:.4g} 1/s.{proof} With the disturbances the cost is "
         f"{percent(judged.excess)} above the least."
     )
 

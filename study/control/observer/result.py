@@ -37,6 +37,8 @@ class ObservedStudy:
             "delay": own.filter.delay,
             "period": found.controller.period,
             "abscissa": judged.abscissa,
+            "modes_kept": None if found.loop.complete else len(found.loop.plant.omega),
+            "small_gain": judged.small_gain,
             "abscissa_known": judged.abscissa_known,
             "abscissa_without": found.without,
             "cost_rate": judged.cost,

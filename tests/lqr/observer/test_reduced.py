@@ -21,7 +21,9 @@ from softgrasp.lqr.loop.controller import Controller
 from softgrasp.lqr.observer.judge import Ticks, loop_map, make_ticks
 from softgrasp.lqr.observer.reduced import reduced_filter
 from softgrasp.lqr.observer.sensors import make_disturbance
+from softgrasp.lqr.observer.tail import rest_of
 from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 
 OBSERVER = "control.observer={markers=[[0,0],[1,0],[0,1],[1,1]],disturbance={box=[[0,0],[1,0]]}}"
 SMALL = "tissue.cells=[4,8]"
@@ -91,6 +93,41 @@ def test_swings_that_the_noise_hides_add_up_to_it() -> None:
         # samples of 1 ms for an integral, and a decay of 1.4 % of the third mode's frequency
         assert abs(gramian[0, 0] * (modes.omega[mode] * eta) ** 2 - 1) < 0.02
         assert (seen.share[:, i] <= 1).all()
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_loop_of_few_modes_and_the_rest_is_the_whole_one_and_the_rest_is_bounded(delay: int) -> None:
+    """det(zI - F) = det(zI - F_few) det(zI - A_rest) det(I - T D); small gain of a good filter, not of a naive one."""
+    made, found, ticks = observed("control.Q=1e6")
+    problem, kept, n, K = made.problem, 30, len(found.loop.plant.omega), found.controller.K
+    few, acting = ModalLoop(problem, kept), make_disturbance(problem, 0.02, 0.05, [[0, 0], [1, 0]])
+    small, rest = make_ticks(problem, few, found.sensors, acting, 1e-3), rest_of(problem, few, found.sensors, 1e-3)
+    left = np.r_[4 + kept : 4 + n, 4 + n + kept : 4 + 2 * n]
+    A, B, C = ticks.A[np.ix_(left, left)], ticks.B[left], ticks.C[:, left]
+
+    def from_inputs(z: complex) -> np.ndarray:
+        return C @ np.linalg.solve(z * np.eye(len(left)) - A, B)
+
+    assert found.controller.observer is not None
+    good = replace(found.controller.observer, delay=delay)
+    naive = reduced_filter(problem, found.loop.plant, found.sensors, acting, 14, 1e-3, delay, weight=0.0).filter
+    largest = max(np.linalg.norm(from_inputs(z) / ticks.sd[:, None], 2) for z in np.exp(1j * np.geomspace(1e-3, 3, 99)))
+    assert largest <= rest.size
+    gains = []
+    for own in (good, naive):
+        whole, part = loop_map(ticks, K, own), loop_map(small, K, own)
+        F, enter = part.F, part.noise[:, -len(small.sd) :] / small.sd
+        leave, direct = K @ part.estimate, K @ part.direct / small.sd
+        gains.append(rest.gain(F, enter, leave, direct))
+        for z in (1.1 * np.exp(0.3j), np.exp(0.01j)):
+            T = leave @ np.linalg.solve(z * np.eye(len(F)) - F, enter) + direct
+            product = np.linalg.slogdet(np.eye(len(T)) - T @ from_inputs(z))
+            parts = [np.linalg.slogdet(z * np.eye(len(X)) - X) for X in (F, A)]
+            # the lowest modes have an error of their own, the residual of SLEPc
+            assert np.isclose(np.linalg.slogdet(z * np.eye(len(whole.F)) - whole.F)[1],
+                              sum(x[1] for x in (product, *parts)), rtol=1e-7)  # fmt: skip
+            assert gains[-1] >= (1 - 1e-6) * np.linalg.norm(T * small.sd, 2) * largest
+    assert gains[0] < 0.5 < 1 < gains[1]
 
 
 def test_correction_solves_the_riccati_equation_of_the_ticks() -> None:

@@ -85,8 +85,11 @@ def test_what_has_no_observer_is_refused_before_the_riccati_equation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("softgrasp.study.control.run.design", lambda *_: pytest.fail("the equation was solved"))
-    with pytest.raises(ControlError, match="at most 1300; this scene has"):
-        control(tmp_path, OBSERVER, "tissue.cells=[30,60]")
+    with pytest.raises(ControlError, match="checked for a hand that does not feel the tissue; this scene has"):
+        control(tmp_path, OBSERVER, "tissue.cells=[30,60]", "effects.reaction=true")
+    with pytest.raises(ControlError, match=r"a plan with control\.observer knows all modes of the plant, at most 1300"):
+        control(tmp_path, OBSERVER, "tissue.cells=[30,60]", "obstacle=[{kind='disc', center=[3.4, 1.2], radius=0.7}]",
+                "control.constraints={force=8.0}")  # fmt: skip
 
 
 def test_a_scene_without_tables_imports_neither_plan_nor_observer_and_keeps_its_bits(tmp_path: Path) -> None:
