@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene, scene_schema
     from softgrasp.fem.scene.table import read_csv
     from softgrasp.fem.scene.text import out_of_range, parse_toml, read_text
-    from softgrasp.fem.shown import counted, length_unit, percent
+    from softgrasp.fem.shown import counted, digits, length_unit, percent
     from softgrasp.fem.solve.costs import STEP_RTOL
     from softgrasp.fem.solve.modes import lowest_modes
     from softgrasp.fem.solve.solvers import ITERATIVE

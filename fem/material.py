@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from softgrasp.fem.shown import MOST_LAYERS, amount
+from softgrasp.fem.shown import MOST_LAYERS, amount, digits
 
 REST = "rest"  # name of the part of an own energy that no parameter multiplies
 
@@ -85,10 +85,11 @@ def in_words(materials: Sequence[LayerMaterial]) -> str:
     layers, own = of_layers(materials), [m for m in materials if m.part and m.part != REST]
     if len(layers) > MOST_LAYERS:
         return f"{len(layers)} layers"
-    parameters = [f"{m.part} = {m.mu:.4g}" for m in own] if len(own) <= 2 * MOST_LAYERS else [f"{len(own)} parameters"]
+    many = len(own) > 2 * MOST_LAYERS
+    parameters = [f"{len(own)} parameters"] if many else [f"{m.part} = {digits(m.mu)}" for m in own]
     return "; ".join(
         [
-            f"lambda = {m.lam:.4g} Pa, mu = {m.mu:.4g} Pa, rho = {m.rho:.4g} kg/m3"
+            f"lambda = {digits(m.lam)} Pa, mu = {digits(m.mu)} Pa, rho = {digits(m.rho)} kg/m3"
             + (f", beta = {amount(m.beta, 's')}" if m.beta else "")
             for m in layers
         ]

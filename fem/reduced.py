@@ -28,7 +28,9 @@ class ReducedSystemError(SoftgraspError):
 
 
 def midpoint_map(E: Array, A: Array, loads: Array, dt: float) -> Array:
-    """[P, Q] of x_{n+1} = P x_n + Q u_n: (E - dt/2 A)^-1 [E + dt/2 A, dt loads], (..., N, N + m). Not collective.
+    """[P, Q] of x_{n+1} = P x_n + Q u_n: [1, 0] + dt (E - dt/2 A)^-1 [A, loads], (..., N, N + m). Not collective.
+
+    P is (E - dt/2 A)^-1 (E + dt/2 A); written so, it keeps what A does not move, as the place of a free hand, exactly.
 
     Args:
         E: matrix of the rates, (N, N).
@@ -40,9 +42,12 @@ def midpoint_map(E: Array, A: Array, loads: Array, dt: float) -> Array:
         SolverError: E - dt/2 A is singular.
     """
     try:
-        return np.linalg.solve(E - dt / 2 * A, np.concatenate([E + dt / 2 * A, dt * loads], axis=-1))
+        both = np.linalg.solve(E - dt / 2 * A, dt * np.concatenate([A, loads], axis=-1))
     except np.linalg.LinAlgError as error:
         raise SolverError(f"E - dt/2 A is singular at dt = {dt:g} s; use another step") from error
+    i = np.arange(A.shape[-1])
+    both[..., i, i] += 1
+    return both
 
 
 @dataclass(frozen=True)

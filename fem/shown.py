@@ -63,7 +63,7 @@ def brief(value: Any) -> str:
     if isinstance(value, np.ndarray):
         return f"array {value.shape}"
     if isinstance(value, str | bool | int | float | complex | FunctionType | None):
-        text = getattr(value, "__name__", None) or (f"{value:.4g}" if isinstance(value, float) else str(value))
+        text = getattr(value, "__name__", None) or (digits(value) if isinstance(value, float) else str(value))
         return text if len(text) <= 40 else text[:37] + "..."
     if isinstance(value, tuple | list | dict):
         return counted(len(value), "entry", "entries")
@@ -72,7 +72,13 @@ def brief(value: Any) -> str:
 
 def amount(value: float, unit: str = "") -> str:
     """A number of three digits with its unit: "0.0123 m"."""
-    return f"{value:.3g} {unit}".rstrip()
+    return f"{digits(value, 3)} {unit}".rstrip()
+
+
+def digits(value: float, count: int = 4) -> str:
+    """A number of some digits, below ten million without a power of ten: "30000"."""
+    text = f"{value:.{count}g}"
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e7 else text
 
 
 def counted(number: int, one: str, many: str = "") -> str:
@@ -95,12 +101,7 @@ def length_unit(largest: float) -> tuple[float, str]:
 
 
 def percent(share: float, sign: str = "") -> str:
-    """A share as a percentage of two digits, "+" with its sign, below 0.0001 % as a number.
-
-    "> 9999 %" also where it is not finite.
-    """
+    """A share as a percentage of two digits, "+" with its sign; "> 9999 %" also where it is not finite."""
     if not abs(share) < 100:
         return "< -9999 %" if share < 0 else "> 9999 %"
-    if 0 < abs(share) < 1e-6:
-        return f"{share:{sign}.2g}"
     return f"{100 * share:{sign}{'.2g' if abs(share) < 0.995 else '.0f'}} %"

@@ -12,6 +12,7 @@ from softgrasp.fem.material import LayerMaterial, scaled
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.shown import digits
 from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.replay import FullRun, full_run
 
@@ -40,10 +41,10 @@ def outside(model: Model) -> str:
             return f"the tangent of the energy is not affine in {key}"
     for key, value, (low, high) in zip(("lambda", "mu"), (first.lam, first.mu), box, strict=True):
         if value <= 0:
-            return f"{key} = {value:.4g} Pa of the scene is not positive, and the box is logarithmic"
+            return f"{key} = {digits(value)} Pa of the scene is not positive, and the box is logarithmic"
         if not low <= value <= high:
             return (
-                f"{key} = {value:.4g} Pa of the scene lies outside reduction.{key}_range = [{low:g}, {high:g}]; "
+                f"{key} = {digits(value)} Pa of the scene lies outside reduction.{key}_range = [{low:g}, {high:g}]; "
                 "set that key to test other parameters"
             )
     return ""

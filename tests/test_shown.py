@@ -15,7 +15,7 @@ from PIL import Image
 import softgrasp as sg
 from softgrasp.fem.errors import SceneError, SoftgraspError
 from softgrasp.fem.reduced import ReducedSystem
-from softgrasp.fem.shown import Shown, percent
+from softgrasp.fem.shown import Shown, amount, digits, percent
 from softgrasp.lqr.loop.full import LoopOptions
 from softgrasp.lqr.loop.margins import loop_margins
 
@@ -267,4 +267,11 @@ def test_percentages_have_two_digits_and_a_sign_on_request() -> None:
     assert [percent(x) for x in (0.0037, -0.054, 0.999, -1.55, 200.0, -200.0, float("nan"))] == [
         "0.37 %", "-5.4 %", "100 %", "-155 %", "> 9999 %", "< -9999 %", "> 9999 %",
     ]  # fmt: skip
-    assert [percent(x, "+") for x in (0.0037, -0.054, 5.3)] == ["+0.37 %", "-5.4 %", "+530 %"]
+    assert [percent(x, "+") for x in (0.0037, -0.054, 5.3, 9e-7)] == ["+0.37 %", "-5.4 %", "+530 %", "+9e-05 %"]
+
+
+def test_moduli_are_written_out_below_ten_million() -> None:
+    assert [digits(x) for x in (3e4, -45678.9, 0.00301, 9.9996e6, 2.1e11)] == [
+        "30000", "-45680", "0.00301", "10000000", "2.1e+11",
+    ]  # fmt: skip
+    assert amount(3e4, "Pa") == "30000 Pa"

@@ -6,8 +6,9 @@ With r_n = dJ/dy_n and x_{n+1/2} = (x_n + x_{n+1}) / 2,
     dJ/dA = h sum_n l_n x_{n+1/2}',   dJ/dE = -sum_n l_n (x_{n+1} - x_n)',   dJ/df = h sum_n l_n,   dJ/du_n = h B' l_n,
 
 in the rows of the tissue alone where the hand is prescribed. The discrete run is differentiated, so that the
-derivatives are exact to rounding, for the cost of about a run whatever their number. The way back is in the model's own
-coordinates: in those of the energy, as the run is, its rounding was ten to a hundred times larger (block, N = 36).
+derivatives are exact to rounding, for the cost of about a run whatever their number. The way back is in coordinates of
+the energy, as the run is: x = X w and l = X m, with X'E X and X'A X in place of E and A. It steps the costate itself:
+to carry (E - h/2 A)' l_n and to divide at the end lost four digits (block, N = 36), in any coordinates.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from softgrasp.fem.reduced import MidpointSteps
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory, run
 from softgrasp.reduction.operators import Parameters
+from softgrasp.reduction.propagator import Propagator, propagator
 from softgrasp.reduction.system import EnergySystem, ModelError
 
 
@@ -61,13 +63,14 @@ def reduced_gradient(
     settled = isinstance(x0, str)
     if isinstance(x0, str) and x0 != "equilibrium":
         raise ModelError(f"x0 = '{x0}': the initial state must be an array of N numbers, or 'equilibrium'")
-    answer = run(system, dt, force, hand, system.equilibrium() if isinstance(x0, str) else x0)
+    step = propagator(system, dt, hand is not None)
+    answer = run(step, dt, force, hand, system.equilibrium() if isinstance(x0, str) else x0)
     value, r = loss(answer.outputs)
     r = np.asarray(r, dtype=float)
     if r.shape != answer.outputs.shape:
         raise ModelError(f"dJ/dy has the shape {r.shape}; it must be {answer.outputs.shape}, that of the outputs")
     rows = slice(0 if hand is None else 2 * system.n_s, system.N)
-    costate = adjoint(system, rows, r, dt)
+    costate = adjoint(step, r)
     x = answer.x
     slope_a, slope_e, slope_f = (
         dt / 2 * costate.T @ (x[1:] + x[:-1]),
@@ -112,11 +115,12 @@ def reduced_gradient(
     )
 
 
-def adjoint(system: EnergySystem, rows: slice, r: Array, dt: float) -> Array:
-    """l_n of all steps in some rows, (steps, rows), for r = dJ/dy (steps + 1, p)."""
-    E, A, C = system.E[rows, rows].T, system.A[rows, rows].T, system.C[:, rows].T
-    back = MidpointSteps(dt, E, A, np.hstack([C / dt, np.zeros((len(C), 1))]))
-    return back.march(r[:0:-1], np.zeros(len(E)))[:0:-1]
+def adjoint(step: Propagator, r: Array) -> Array:
+    """l_n of all steps in the rows of the step, (steps, rows), for r = dJ/dy (steps + 1, p)."""
+    X = step.at.X
+    E, A, C = X.T @ step.E, X.T @ step.A, step.model.C[:, -len(X) :] @ X
+    back = MidpointSteps(step.dt, E.T, A.T, np.hstack([C.T / step.dt, np.zeros((len(X), 1))]))
+    return back.march(r[:0:-1], np.zeros(len(X)))[:0:-1] @ X.T
 
 
 def _start(system: EnergySystem, rows: slice, r: Array, costate: Array, dt: float) -> Array:

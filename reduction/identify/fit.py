@@ -223,11 +223,17 @@ class Linearisation:
     """The fit near its end, d log theta = inverse @ (change of data over sigma)."""
 
     inverse: Array  # influence of each datum, (k, m)
+    beside: Array  # its influence on each nuisance, (nuisances, m)
     covariance: Array  # of log theta by the noise, (k, k)
     sizes: Array  # singular values of the Jacobian, its change per sigma, (k,)
     directions: Array  # rows are its directions of log theta, (k, k)
     residual: Array  # (m,) [sigma]
     whole: Array  # covariance of [log theta, nuisances]
+
+    @property
+    def noise(self) -> Array:
+        """Standard deviation of log theta by the noise, (k,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
 def linearise(misfit: Misfit, p: Array, robust: bool) -> Linearisation:
@@ -240,7 +246,8 @@ def linearise(misfit: Misfit, p: Array, robust: bool) -> Linearisation:
     inverse = np.linalg.pinv(apart(root * J, misfit.k)) * root.T
     by_psi, all_by_psi = inverse / slope, whole / slope
     _, sizes, directions = np.linalg.svd(apart(root * J, misfit.k), full_matrices=False)
-    return Linearisation(inverse, (by_psi * psi2) @ by_psi.T, sizes, directions, r, (all_by_psi * psi2) @ all_by_psi.T)
+    covariances = [(influence * psi2) @ influence.T for influence in (by_psi, all_by_psi)]
+    return Linearisation(inverse, whole[misfit.k :], covariances[0], sizes, directions, r, covariances[1])
 
 
 def by_experiment(misfit: Misfit, values: Array) -> Iterator[Array]:

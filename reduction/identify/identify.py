@@ -37,7 +37,7 @@ from softgrasp.reduction.identify.parts import (
     finer_tolerance,
 )
 from softgrasp.reduction.identify.posterior import check_posterior, sample
-from softgrasp.reduction.identify.result import Identified
+from softgrasp.reduction.identify.result import Identified, Nuisance
 from softgrasp.reduction.identify.unknowns import Unknown, parse_unknowns, scene_at, value_of
 from softgrasp.reduction.identify.verdict import judge, reasons, unseen, warnings
 
@@ -221,7 +221,7 @@ def _solve(
         found = fit_rounds(make, experiments, start, asked.sigma, nuisances, robust=asked.robust, progress=asked.tick)
         line, theta = linearise(found.misfit, found.p, asked.robust), np.exp(found.p[:k])
         errors = errors_of_outputs(found.misfit.near, theta, found.misfit.answers(found.p)[1], experiments)
-        lost, noise = errors.of_values(found.misfit, line, found.p)["reduction"], np.sqrt(np.diag(line.covariance))
+        lost, noise = errors.through(line.inverse, found.misfit, found.p)["reduction"], line.noise
         done = found.unsettled or found.misfit.near.whole_range or lost is None or (np.abs(lost) <= noise).all()
         if done or again == MORE_ROUNDS:
             return Solved(found, line, errors, "linear" if strain is None else strain.law)
@@ -302,8 +302,8 @@ def _answer(solved: Solved, start: Array, asked: Asked) -> Identified:
     """What a fit answers."""
     found, line, misfit, robust = solved.fit, solved.line, solved.fit.misfit, asked.robust
     k, unknowns, data = misfit.k, tuple(misfit.near.unknowns), tuple(e.data for e in misfit.experiments)
-    values, noise = np.exp(found.p[:k]), np.sqrt(np.diag(line.covariance))
-    parts, kinds = solved.errors.of_values(misfit, line, found.p), solved.errors.kinds(solved.law)
+    values, noise = np.exp(found.p[:k]), line.noise
+    parts, kinds = solved.errors.through(line.inverse, misfit, found.p), solved.errors.kinds(solved.law)
     model, estimate = misfit.near.full(values), solved.errors.estimate
     tables = list(by_experiment(misfit, line.residual))
     judged = judge(line.residual, tables, len(found.p), robust)
@@ -317,7 +317,7 @@ def _answer(solved: Solved, start: Array, asked: Asked) -> Identified:
         unknowns=unknowns, start=start, values=values, noise=noise, parts=parts, kinds=kinds, law=solved.law,
         covariance=line.covariance, sight=line.sizes, directions=line.directions,
         assumed={u.name: -line.inverse @ misfit.slopes(found.p, [u])[:, 0] for u in misfit.near.rests_on()},
-        nuisances=_nuisances(misfit.nuisances, found.p[k:], np.sqrt(np.diag(line.whole)[k:]), data, columns),
+        nuisances=_nuisances(solved, data, columns),
         residuals=judged,
         reasons=reasons(unknowns, judged, found.unsettled, unseen(unknowns, line.sizes, line.directions), noise,
             parts, _cures(parts, noise, estimate, model.scene, own), found.edges),
@@ -357,10 +357,12 @@ def refinement(answer: Identified) -> Scene | None:
     return finer_scene(scene, tolerance, steps, estimate.time_error)
 
 
-def _nuisances(
-    nuisances: Nuisances, values: Array, deviations: Array, data: Sequence[Measurements], columns: Columns
-) -> tuple[tuple[str, float, float], ...]:
-    """Names with units, values and deviations of what was fitted beside the material."""
-    names = [f"offset of {columns[j].label} in {data[i].name} [{columns[j].unit}]" for i, j in nuisances.offsets]
-    names += [f"time shift of {data[i].name} [s]" for i in nuisances.shifts]
-    return tuple((n, float(v), float(s)) for n, v, s in zip(names, values, deviations, strict=True))
+def _nuisances(solved: Solved, data: Sequence[Measurements], columns: Columns) -> tuple[Nuisance, ...]:
+    """What was fitted beside the material, with its errors."""
+    misfit, p, k = solved.fit.misfit, solved.fit.p, solved.fit.misfit.k
+    parts, noise = solved.errors.through(solved.line.beside, misfit, p), np.sqrt(np.diag(solved.line.whole)[k:])
+    own, every = misfit.nuisances, range(misfit.nuisances.count)
+    names = [f"offset of {columns[j].label} in {data[i].name} [{columns[j].unit}]" for i, j in own.offsets]
+    names += [f"time shift of {data[i].name} [s]" for i in own.shifts]
+    each = [{cause: None if part is None else float(part[n]) for cause, part in parts.items()} for n in every]
+    return tuple(map(Nuisance, names, p[k:].tolist(), noise.tolist(), each))

@@ -14,7 +14,7 @@ from softgrasp.fem.model.build import MeshEstimate
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.identify.fit import Linearisation, Misfit
+from softgrasp.reduction.identify.fit import Misfit
 from softgrasp.reduction.identify.near import Experiment, Local, same_motion
 from softgrasp.reduction.online import ReducedTrajectory
 
@@ -35,14 +35,16 @@ class OutputErrors:
     bounds: list[Bound] | None  # of the reduction, instead of its signed error
     estimate: MeshEstimate | None  # that of the mesh, of the first experiment; None where there is none
 
-    def of_values(self, misfit: Misfit, line: Linearisation, p: Array) -> dict[str, Array | None]:
-        """Relative error of the values by cause, (k,), None where it is not known: J+ delta, or at most |J+| bound."""
+    def through(self, inverse: Array, misfit: Misfit, p: Array) -> dict[str, Array | None]:
+        """Error of what is fitted by cause, (k,), None where it is not known: J+ delta, or at most |J+| bound.
+
+        ``inverse``: J+ of the logarithms of the values or of the nuisances, (k, m).
+        """
         parts = {
-            name: None if error is None else line.inverse @ misfit.together(error, p)
-            for name, error in self.signed.items()
+            name: None if error is None else inverse @ misfit.together(error, p) for name, error in self.signed.items()
         }
         if self.bounds is not None:
-            parts["reduction"] = np.abs(line.inverse) @ misfit.bounds([b.values for b in self.bounds], p)
+            parts["reduction"] = np.abs(inverse) @ misfit.bounds([b.values for b in self.bounds], p)
         return parts
 
     def kinds(self, law: str) -> dict[str, str]:

@@ -10,11 +10,26 @@ from softgrasp.fem.columns import Columns
 from softgrasp.fem.model.build import MeshEstimate, Model
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.shown import Card, Shown, percent
+from softgrasp.fem.shown import Card, Shown, digits, percent
 from softgrasp.reduction.identify.data import Measurements
 from softgrasp.reduction.identify.posterior import Posterior
 from softgrasp.reduction.identify.unknowns import Unknown
 from softgrasp.reduction.identify.verdict import Residuals
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """An offset or a time shift that was fitted beside the material, with its errors, all in its own unit."""
+
+    name: str  # with the unit: "offset of tip_x in camera [m]"
+    value: float  # as it was fitted
+    noise: float  # standard deviation by the noise
+    parts: dict[str, float | None]  # what "mesh", "time step" and "reduction" make of value - truth; None: not known
+
+    @property
+    def total(self) -> float:
+        """Noise and the sizes of the other parts together."""
+        return self.noise + sum(abs(part) for part in self.parts.values() if part is not None)
 
 
 @dataclass(frozen=True, repr=False)
@@ -47,8 +62,8 @@ class Identified(Shown):
     """Directions of log(values), one a row, the best seen first, (k, k) [1]."""
     assumed: dict[str, Array]
     """Change of log(values) by a unit of the logarithm of each parameter that was not fitted, by its name, (k,) [1]."""
-    nuisances: tuple[tuple[str, float, float], ...]
-    """Name with unit, value and standard deviation of each offset and time shift that was fitted too."""
+    nuisances: tuple[Nuisance, ...]
+    """Each offset and time shift that was fitted too, with its errors."""
     residuals: Residuals
     """Size and whiteness of the residuals."""
     reasons: tuple[str, ...]
@@ -98,7 +113,7 @@ class Identified(Shown):
             parts += [
                 f"{name} {'not known' if part is None else percent(part[i], '+')}" for name, part in self.parts.items()
             ]
-            result.append((u.name, f"{self.values[i]:.4g} {u.unit}, {', '.join(parts)}"))
+            result.append((u.name, f"{digits(self.values[i])} {u.unit}, {', '.join(parts)}"))
         return result
 
     def card(self) -> Card:

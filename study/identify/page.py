@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem.columns import labels
+from softgrasp.fem.shown import counted, digits
 from softgrasp.reduction.identify.result import Identified
 from softgrasp.reduction.identify.verdict import BY_CHANCE, direction_in_words
 from softgrasp.study.report import Section, Share, Table, captioned, in_words, of_scene, percent
@@ -113,7 +114,12 @@ def assumed_table(answer: Identified) -> Table:
 
 def nuisance_table(answer: Identified) -> Table:
     """Offsets and time shifts."""
-    return Table(("fitted beside the material", "value", "standard deviation"), answer.nuisances, "Markers and clocks")
+    parts = tuple(answer.nuisances[0].parts)
+    rows = [
+        (n.name, n.value, n.noise, *("not known" if n.parts[key] is None else n.parts[key] for key in parts), n.total)
+        for n in answer.nuisances
+    ]
+    return Table(("fitted beside the material", "value", "noise", *parts, "together"), rows, "Markers and clocks")
 
 
 def residual_table(answer: Identified) -> Table:
@@ -136,8 +142,10 @@ def fit_rows(answer: Identified) -> list[tuple[str, str]]:
         for i in range(k)
         for j in range(i)
     ]
+    seen = np.vstack([np.isfinite(data.values) for data in answer.data]).any(axis=0)
+    names = [name for name, one in zip(labels(answer.columns), seen, strict=True) if one]
     return [
-        ("numbers", f"{r.count} of {in_words(labels(answer.columns))}, in {len(answer.data)} experiment(s)"),
+        ("numbers", f"{r.count} of {in_words(names)}, in {counted(len(answer.data), 'experiment')}"),
         ("mesh", f"n_e = {answer.model.system.layout.n_e}, {answer.scene.time.steps} time steps, those of fitted.toml"),
         ("misfit", f"{r.misfit:.4g} sigma, by chance at most {r.limit:.4g}"),
         ("white", f"correlation of neighbours {r.lag:+.2g}, probability by chance {max(r.white, 1e-15):.2g}"),
@@ -153,7 +161,7 @@ def error_sentence(answer: Identified) -> str:
     if answer.reasons:
         return "The answer is refused; do not use its values."
     values = [
-        f"{u.name} = {v:.4g} {u.unit} with an error of about {percent(e)}"
+        f"{u.name} = {digits(v)} {u.unit} with an error of about {percent(e)}"
         for u, v, e in zip(answer.unknowns, answer.values, answer.total, strict=True)
     ]
     return f"The data give {in_words(values)}."
@@ -194,7 +202,10 @@ def result_of(answer: Identified) -> dict[str, Any]:
             for s, d in zip(answer.sight, answer.directions, strict=True)
         ],
         "assumed": answer.assumed,
-        "beside": [{"name": n, "value": v, "deviation": s} for n, v, s in answer.nuisances],
+        "beside": [
+            {"name": n.name, "value": n.value, "noise": n.noise, **n.parts, "together": n.total}
+            for n in answer.nuisances
+        ],
         "residuals": answer.residuals,
         "posterior": answer.posterior,
         "history": answer.history,

@@ -15,7 +15,7 @@ import rich.table
 from rich.console import Console
 from rich.markup import escape
 
-from softgrasp.fem import counted, note, percent
+from softgrasp.fem import counted, digits, note, percent
 from softgrasp.study.report.equation import Equation
 
 Columns = Mapping[str, str | Callable[[Any], Any]]
@@ -139,7 +139,7 @@ def cell_text(cell: Any) -> str:
         return "yes" if cell else "no"
     if isinstance(cell, Share):
         return percent(cell)
-    return f"{cell:.4g}" if isinstance(cell, float | np.floating) else str(cell)
+    return digits(cell) if isinstance(cell, float | np.floating) else str(cell)
 
 
 def number(value: float | None) -> str:

@@ -41,10 +41,13 @@ def test_samples_of_a_linear_model_have_its_covariance_where_that_is_thin() -> N
     covariance = np.linalg.inv(J.T @ J)
     assert covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]) < -0.999
     wide = SimpleNamespace(limits=lambda p: (p - 1, p + 1))
-    found = sample(SimpleNamespace(k=3, near=wide, residual=lambda x: J @ x), np.zeros(3), covariance, 2000, False)
+    found = sample(SimpleNamespace(k=3, near=wide, residual=lambda x: J @ x), np.zeros(3), covariance, 1000, False)
     noise = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(found.deviations, noise, rtol=4 / np.sqrt(2 * found.independent))
     assert (np.abs(found.mean) < 4 / np.sqrt(found.independent) * noise).all()
+    S = found.correlation * np.outer(found.deviations, found.deviations) + np.outer(found.mean, found.mean)
+    # mean square of three normal numbers; 1.69 where the walkers start by the deviations without the correlation
+    assert abs(np.trace(J @ S @ J.T) / 3 - 1) < 4 * np.sqrt(2 / 3 / found.independent)
 
 
 def test_what_cannot_be_sampled_is_refused_before_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
