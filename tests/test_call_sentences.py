@@ -293,6 +293,9 @@ FRICTION = "obstacle=[{kind='halfspace', name='a', normal=[0, 1], offset=-1.0, f
 TWICE = "control.outputs=[{kind='hand', name='a'}, {kind='hand', name='a'}]"
 SENTENCES: list[tuple[Act, str]] = [
     (own_energy("x = 1", "W"), "law.py: it has no function 'W', which tissue.energy = '"),
+    (lambda *_: sg.build("paper_forward", ["tissue.energy='given'"]), "the energy was a Python function; build the "),
+    (lambda *_: sg.build("paper_forward", terms=[sg.Term("bed", lambda u, v: u[0] * v[0] * ufl.dx(scheme="no"), 1.0)]),
+     "the term bed: its form(u, v) cannot be compiled, "),
     (given(surface), "The given mesh is a surface in space (gdim 3); make a plane mesh with gdim = 2."),
     (given(single), "The given mesh has coordinates of float32; make it with float64."),
     (lambda *_: model().with_materials(young=-1.0, poisson=0.3), "young = -1.0, poisson = 0.3: young must be > 0, "),
