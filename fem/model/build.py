@@ -40,7 +40,7 @@ from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.materials import lame
 from softgrasp.fem.scene.scene import Scene, check_dimension
 from softgrasp.fem.scene.table import read_motion
-from softgrasp.fem.shown import Card, Shown, listed
+from softgrasp.fem.shown import Card, Shown, listed, percent
 from softgrasp.fem.system import BlockSystem, LayerBlocks, coupling, tissue_matrices
 
 if TYPE_CHECKING:
@@ -119,7 +119,9 @@ class Model(Shown):
         """Mesh, unknowns, materials, effects and the error of the mesh."""
         layout, scene, error = self.system.layout, self.scene, self.accuracy
         on = [name for name, value in scene.effects if value not in (None, False)]
-        estimate = "not estimated" if error is None else f"{100 * error.estimate:.2g} % of the deformation, estimated"
+        estimate = "not estimated here; softgrasp explain and simulate do"
+        if error is not None:
+            estimate = f"{percent(error.estimate)} of the deformation, estimated"
         rows = (
             ("mesh", f"{layout.dimension}D, P{layout.order}, {self.cells} cells"),
             ("unknowns", f"hand {layout.n_s}, tissue {layout.n_e}, {self.states} states"),
