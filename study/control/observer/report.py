@@ -89,7 +89,8 @@ def facts(study: ObservedStudy) -> Iterator[tuple[str, str]]:
         yield "noise of what is left out", f"{found.weight:g} times the estimate: with less the full loop is not stable"
     for name, value in found.without.items():
         kept = "with the hand's samples alone" if name == "all but the hand" else f"without {name}"
-        yield f"abscissa {kept}", f"{value:.4g} 1/s" + ("" if value < 0 else ": not stable")
+        of = "" if found.loop.complete else " of the lowest modes, no bound on the others"
+        yield f"abscissa {kept}", f"{value:.4g} 1/s{of}" + ("" if value < 0 else ": not stable")
     if found.full is not None and study.sd_nodes is not None:
         solution, (low, middle, high) = found.full.solution, study.sd_nodes
         yield (
