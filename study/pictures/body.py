@@ -30,6 +30,7 @@ MANY_CELLS = 300_000  # above, a picture shows the outline only
 PAD, GAP, LINE = 0.1, 0.14, 0.18  # around the scene, between panels, height of a line of text [inch]
 ROUNDING = 1e-12  # of the size of the body: what is smaller is no deformation
 CAPTION = 0.72  # width of a caption [inch]
+HALO = [withStroke(linewidth=2.5, foreground="white")]  # parts a caption from a path behind it
 DOTS: Any = (0, (1, 1.2))
 DASHES: Any = (0, (5, 3))
 
@@ -256,7 +257,7 @@ def _upright(move: MoveView) -> bool:
 def _caption(ax: Any, move: MoveView, box: Array, text: str) -> None:
     """A caption below the box of a body, or to its right if the bodies stand above each other."""
     if _upright(move):
-        look: dict[str, Any] = {"xytext": (4, 0), "ha": "left", "va": "center"}
+        look: dict[str, Any] = {"xytext": (4, 0), "ha": "left", "va": "center", "path_effects": HALO}
         ax.annotate(text, (box[1, 0], box[:, 1].mean()), textcoords="offset points", zorder=6, **look)
         return
     left, right = ax.get_xlim()
@@ -266,7 +267,7 @@ def _caption(ax: Any, move: MoveView, box: Array, text: str) -> None:
     middle = max(middle, box[0, 0] + half) if way.prod() > 0 else middle
     middle = min(middle, box[1, 0] - half) if way.prod() < 0 else middle
     middle = min(max(middle, left + half), max(right - half, left + half))
-    look = {"xytext": (0, -3), "ha": "center", "va": "top"}
+    look = {"xytext": (0, -3), "ha": "center", "va": "top", "path_effects": HALO}
     ax.annotate(text, (middle, box[0, 1]), textcoords="offset points", zorder=6, **look)
 
 
