@@ -139,7 +139,7 @@ def cell_text(cell: Any) -> str:
         return "yes" if cell else "no"
     if isinstance(cell, Share):
         return percent(cell)
-    return digits(cell) if isinstance(cell, float | np.floating) else str(cell)
+    return digits(float(cell)) if isinstance(cell, float | np.floating) else str(cell)
 
 
 def number(value: float | None) -> str:
