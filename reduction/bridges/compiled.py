@@ -17,10 +17,10 @@ void softgrasp_tissue_begin(const Tissue *t, const double *gravity, double *room
 int softgrasp_tissue_end(const Tissue *t, double *room);
 """
 # work arrays of the C struct by name; a size is a product of letters: k coordinates, n velocities of MuJoCo, r a
-# state of both, 6, 9
+# state of both, 3, 6, 9
 ROOM = {"known": "k", "pulled": "k6", "turned": "k6", "pairs": "k99", "six": "n6", "product": "n6", "b": "6",
         "before": "n", "user": "n", "inertia": "66", "force": "6", "wrench": "6", "a": "k", "e": "k",
-        "due": "6", "reached": "r"}  # fmt: skip
+        "due": "3", "reached": "r"}  # fmt: skip
 
 
 class CompiledStep:
@@ -33,7 +33,7 @@ class CompiledStep:
         self._ffi, self._code = compiled
         self._body, self._gravity, self._data = tissue.body, tissue.mj_model.opt.gravity, None
         small, k, nv = tissue.small, len(tissue.a), tissue.mj_model.nv
-        sizes = {"k": k, "n": nv, "6": 6, "9": 9, "r": 1 + tissue.mj_model.nq + nv + 2 * k}
+        sizes = {"k": k, "n": nv, "3": 3, "6": 6, "9": 9, "r": 1 + tissue.mj_model.nq + nv + 2 * k}
         room = {name: np.zeros(int(np.prod([sizes[c] for c in size]))) for name, size in ROOM.items()}
         given = {
             "E": small.E, "sums": tissue._loads, "G": small.G, "K": small.K, "D": small.D + tissue.dt / 2 * small.K,
@@ -67,9 +67,8 @@ class CompiledStep:
     def begin(self, data: Any, a: Array, e: Array) -> None:
         """Add inertia to MuJoCo's mass matrix and loads to its applied forces, from coordinates a and rates e, (k,)."""
         if data is not self._data:  # its arrays stay where they are
-            place = (data.xmat[self._body], data.xpos[self._body])
-            self._data, self._views = data, (*place, data.qpos, data.qvel, data.M, data.qfrc_applied)
-            for name, view in zip(("Q", "x", "qpos", "qvel", "M", "applied"), self._views, strict=True):
+            self._data, self._views = data, (data.xmat[self._body], data.qpos, data.qvel, data.M, data.qfrc_applied)
+            for name, view in zip(("Q", "qpos", "qvel", "M", "applied"), self._views, strict=True):
                 setattr(self._struct, name, self._at(view))
         self._arrays["a"][:], self._arrays["e"][:] = a, e
         self._code.softgrasp_tissue_begin(self._struct, self._fall, self._room_at)

@@ -14,11 +14,10 @@ torque. The midpoint rule over a step h, with M_a, G_a and v at half of it by ex
 so that MuJoCo solves for robot and tissue together, contact included: the bracket goes into its mass matrix, which is
 factored again, the right-hand side is a generalised force, and action is reaction.
 
-The momenta of all tissue [P; L], rigid motion included, change over a step by what the body gave, but for an error of
-the second order in h, from axes and gyroscopic forces at the start of it. What they are above the sum due goes back to
-the body in the next step: the errors do not add up, and a free body keeps its momenta but for what MuJoCo loses of the
-rigid rest. After a change of the state by the user the sum begins anew. `step.c` has the small algebra; without a
-compiler NumPy does it.
+The linear momentum P of all tissue, rigid motion included, changes over a step by what the body gave, but for an error
+of the second order in h, from axes and gyroscopic forces at the start of it. In a tree that begins with a free joint
+what P is above the sum due is taken from the body in the next step, so that the errors do not add up. After a change
+of the state by the user the sum begins anew. `step.c` has the small algebra; without a compiler NumPy does it.
 """
 
 from __future__ import annotations
@@ -108,9 +107,8 @@ class MujocoTissue:
         self._loads, self._forces = np.ascontiguousarray(sums), np.hstack([small.K, small.D + dt / 2 * small.K])
         self._turns = np.vstack([np.zeros((2, 9)), AXES.reshape(3, 9)])
         self._J, self._Jd, self._six = np.zeros((6, nv)), np.zeros((6, nv)), np.zeros((6, 6))
-        self._rigid, self._due, self._reached = np.ascontiguousarray(system.rigid), np.zeros(6), np.zeros(0)
-        # a mocap body moves without a velocity
-        self._keeps = bool(mj_model.body_mocapid[mj_model.body_rootid[self.body]] < 0)
+        self._rigid, self._due, self._reached = np.ascontiguousarray(system.rigid), np.zeros(3), np.zeros(0)
+        self._keeps = _floats(self.mujoco, mj_model, self.body)
         self._rows = np.repeat(np.arange(nv, dtype=np.intc), mj_model.M_rownnz)  # of the lower triangle in M
         self._columns = np.array(mj_model.M_colind, dtype=np.intc)
         self._code = CompiledStep.of(self)
@@ -153,19 +151,15 @@ class MujocoTissue:
     def _in_numpy(self, data: Any) -> None:
         """The step after the Jacobian is known."""
         mujoco, model, six, rigid = self.mujoco, self.mj_model, self._six, self._rigid
-        Q, x = data.xmat[self.body].reshape(3, 3), data.xpos[self.body]
+        Q = data.xmat[self.body].reshape(3, 3)
         six[:3, :3] = six[3:, 3:] = Q.T
         J, before = six @ self._J, data.qvel.copy()
-        b, xi, g = six @ (self._Jd @ before), J @ before, Q.T @ model.opt.gravity
-        held, goes_on = _in_space(self._momenta(xi), Q, x), self._goes_on(data)
-        late = (held - self._due) / self.dt
-        late[3:] -= _skew(x) @ late[:3]
-        inertia, force, right, G = self._known(xi[3:], g)
-        middle = self.a + self.dt / 2 * self.e + self.dt / 4 * self._past
-        W = _skew(xi[3:])
-        given = force + np.concatenate([W @ rigid[:3, 3:] @ xi[3:], W @ rigid[3:, 3:] @ xi[3:]])
-        given[3:] += _skew(self.small.G[:, :3].T @ middle) @ g  # weight is no force of the body
-        force = force + six @ late if goes_on else force
+        b, xi = six @ (self._Jd @ before), J @ before
+        held, goes_on = Q @ self._momentum(xi), self._goes_on(data)
+        inertia, force, right, G = self._known(xi[3:], Q.T @ model.opt.gravity)
+        given = force[:3] + _skew(xi[3:]) @ rigid[:3, 3:] @ xi[3:]
+        if goes_on:
+            force[:3] += Q.T @ (held - self._due) / self.dt
         data.M[:] += (J.T @ inertia @ J)[self._rows, self._columns]
         mujoco.mj_factorM(model, data)
         user = data.qfrc_applied.copy()
@@ -176,7 +170,7 @@ class MujocoTissue:
         acceleration = J @ ((data.qvel - before) / self.dt) + b
         self._advance(acceleration, right, G)
         self.wrench = -(inertia @ acceleration + force)
-        self._due = held + self.dt * _in_space(given + (inertia + rigid) @ acceleration, Q, x)
+        self._due = held + self.dt * Q @ (given + (inertia + rigid)[:3] @ acceleration)
         self._reached = np.concatenate([data.qpos, data.qvel, self.a, self.e])
 
     def _goes_on(self, data: Any) -> bool:
@@ -185,17 +179,10 @@ class MujocoTissue:
         same = state.shape == self._reached.shape
         return self._keeps and same and bool(np.all(np.abs(state - self._reached) <= 1e-14 * np.abs(self._reached)))
 
-    def _momenta(self, xi: Array) -> Array:
-        """[P; L] of all tissue about the origin of the body, in its axes, at the velocity xi of the body, (6,)."""
-        k, (V, spin) = len(self.a), xi.reshape(2, 3)
-        integrals = self._integrals @ np.column_stack((self.a, self.e))
-        C = np.dot(self.a, integrals[: 9 * k].reshape(9, k, 2))  # int rho z_k z_l and int rho z_k e_l
-        (m, y), (B, Y) = integrals[9 * k : 9 * k + 3].T, integrals[9 * k + 3 :].T.reshape(2, 3, 3)
-        whole = B + B.T + C[:, 0].reshape(3, 3)
-        p = self._rigid @ xi
-        p[:3] += y + _skew(spin) @ m
-        p[3:] += _skew(m) @ V + whole.trace() * spin - whole @ spin + _axial(Y - C[:, 1].reshape(3, 3))
-        return np.asarray(p)
+    def _momentum(self, xi: Array) -> Array:
+        """P of all tissue in the axes of the body, at its velocity xi (6,), (3,)."""
+        m, y = self.small.G[:, :3].T @ self.a, self.small.G[:, :3].T @ self.e
+        return np.asarray(self._rigid[:3] @ xi + y + _skew(xi[3:]) @ m)
 
     def _known(self, spin: Array, g: Array) -> tuple[Array, Array, Array, Array]:
         """M_a - G_a'S^-1 G_a, G_a'S^-1 r + v, r and G_a at the middle of the step."""
@@ -227,7 +214,8 @@ class MujocoTissue:
         V = square @ whole + W @ (2 * moving)
         force[:3] += square @ m + W @ (2 * sums[:3, 1])
         force[3:] -= lever @ g
-        force[3:] += _axial(V)
+        (_, xy, xz), (yx, _, yz), (zx, zy, _) = V.tolist()
+        force[3:] += (zy - yz, xz - zx, yx - xy)
         return inertia, force, right, G
 
     def _advance(self, acceleration: Array, right: Array, G: Array) -> None:
@@ -239,21 +227,15 @@ class MujocoTissue:
         self._past[:], self._rate[:] = change, acceleration[3:]
 
 
-def _axial(X: Array) -> Array:
-    """[X_32 - X_23; X_13 - X_31; X_21 - X_12], (3,)."""
-    (_, xy, xz), (yx, _, yz), (zx, zy, _) = X.tolist()
-    return np.array((zy - yz, xz - zx, yx - xy))
-
-
-def _in_space(wrench: Array, Q: Array, x: Array) -> Array:
-    """A wrench or momenta about x in the axes Q as about the origin of space in its axes, (6,)."""
-    f, t = wrench.reshape(2, 3) @ Q.T
-    return np.concatenate([f, t + _skew(x) @ f])
-
-
 def _skew(m: Array) -> Array:
     x, y, z = m.tolist()
     return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+
+
+def _floats(mujoco: Any, model: Any, body: int) -> bool:
+    """Whether the tree of a body begins with a free joint."""
+    root = model.body_rootid[body]
+    return bool(model.body_jntnum[root] and model.jnt_type[model.body_jntadr[root]] == mujoco.mjtJoint.mjJNT_FREE)
 
 
 def _mujoco() -> Any:

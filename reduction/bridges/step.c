@@ -6,12 +6,12 @@ typedef struct {
   double h;
   const double *E, *sums, *G, *K, *D, *inverse;   /* (9, k, k), (k, 12), (k, 6); K; D + h/2 K; S^-1: (k, k) */
   const double *rigid;                            /* mass matrix of rigid tissue, (6, 6) */
-  const double *J, *Jd, *Q, *x, *qpos, *qvel;     /* (6, nv) twice in space; axes (3, 3), origin, state of MuJoCo */
+  const double *J, *Jd, *Q, *qpos, *qvel;         /* (6, nv) twice in space; axes (3, 3) and state of MuJoCo */
   double *M, *applied;                            /* of MuJoCo: lower triangle of the mass matrix, forces (nv) */
   const int *rows, *columns;                      /* of the entries of M */
   double *a, *e, *past, *rate;                    /* state, last change of e, last angular acceleration */
   double *inertia, *force, *wrench;               /* (6, 6), (6), (6) */
-  double *due, *reached;                          /* momenta due in space (6), in which state (nq + nv + 2 k + 1) */
+  double *due, *reached;                          /* momentum due in space (3), in which state (1 + nq + nv + 2 k) */
   double *known, *pulled, *turned, *pairs;        /* right-hand side (k), G_a (k, 6), G_a'S^-1 (6, k), (9, k, 2) */
   double *six, *product, *b, *before, *user;      /* J in the axes of the body (6, nv), (6, nv), (6), (nv), (nv) */
 } Tissue;
@@ -117,38 +117,20 @@ static void body(const Tissue *t, const double *g, const double *W, const double
   t->force[5] += V[3] - V[1];
 }
 
-static void cross(const double *a, const double *b, double *to) {
-  to[0] += a[1] * b[2] - a[2] * b[1];
-  to[1] += a[2] * b[0] - a[0] * b[2];
-  to[2] += a[0] * b[1] - a[1] * b[0];
-}
-
-/* Momenta or a wrench about the body's origin in its axes as those about the origin of space in the axes of space. */
-static void to_space(const Tissue *t, const double *p, double *to) {
-  for (int i = 0; i < 6; i++) {
-    const double *q = t->Q + 3 * (i % 3), *u = p + (i < 3 ? 0 : 3);
-    to[i] = q[0] * u[0] + q[1] * u[1] + q[2] * u[2];
-  }
-  cross(t->x, to, to + 3);
-}
-
-/* Linear and angular momentum of all tissue at the velocity xi of the body, from the integrals of its state. */
-static void momenta(const Tissue *t, const double *xi, const double *x, const double *y, const double *C,
-                    const double *F, double *to) {
-  const double *w = xi + 3, *Y = y + 3;
-  double p[6];
-  for (int i = 0; i < 6; i++) p[i] = dot(6, t->rigid + 6 * i, xi) + (i < 3 ? y[i] : 0);
-  cross(w, x, p);
-  cross(x, xi, p + 3);
-  p[3] += Y[7] - Y[5] + F[5] - F[7];
-  p[4] += Y[2] - Y[6] + F[6] - F[2];
-  p[5] += Y[3] - Y[1] + F[1] - F[3];
-  for (int i = 0; i < 3; i++)
-    for (int j = 0; j < 3; j++) {
-      p[3 + i] += (x[3 + 4 * j] * 2 + C[4 * j]) * w[i];
-      p[3 + i] -= (x[3 + 3 * i + j] + x[3 + 3 * j + i] + C[3 * i + j]) * w[j];
+/* Linear momentum of all tissue at the velocity xi of the body, in its axes. */
+static void momentum(const Tissue *t, const double *xi, double *p) {
+  const double *w = xi + 3;
+  double m[3] = {0};
+  for (int c = 0; c < 3; c++) {
+    p[c] = dot(6, t->rigid + 6 * c, xi);
+    for (int i = 0; i < t->k; i++) {
+      m[c] += t->sums[12 * i + c] * t->a[i];
+      p[c] += t->sums[12 * i + c] * t->e[i];
     }
-  to_space(t, p, to);
+  }
+  p[0] += w[1] * m[2] - w[2] * m[1];
+  p[1] += w[2] * m[0] - w[0] * m[2];
+  p[2] += w[0] * m[1] - w[1] * m[0];
 }
 
 /* Whether MuJoCo and the tissue are where the last step left them; a quaternion may have been normalised again. */
@@ -162,36 +144,32 @@ static int goes_on(const Tissue *t) {
   return 1;
 }
 
-/* Force that gives back what the momenta held are above those due, (6,) in the axes of the body. */
-static void missed(const Tissue *t, const double *held, double *to) {
-  double u[6], back[3] = {-t->x[0], -t->x[1], -t->x[2]};
-  for (int i = 0; i < 6; i++) u[i] = (held[i] - t->due[i]) / t->h;
-  cross(back, u, u + 3);
-  for (int i = 0; i < 6; i++) {
-    const double *v = u + (i < 3 ? 0 : 3);
-    to[i] = t->Q[i % 3] * v[0] + t->Q[3 + i % 3] * v[1] + t->Q[6 + i % 3] * v[2];
+/* From the body what the momentum held is above that due; and that due next, but for the part of the accelerations. */
+static void settle_momentum(const Tissue *t, const double *xi) {
+  const double *w = xi + 3;
+  double p[3], whirl[3], held[3], late[3];
+  momentum(t, xi, p);
+  for (int c = 0; c < 3; c++) whirl[c] = dot(3, t->rigid + 6 * c + 3, w);
+  const double given[3] = {t->force[0] + w[1] * whirl[2] - w[2] * whirl[1],
+                           t->force[1] + w[2] * whirl[0] - w[0] * whirl[2],
+                           t->force[2] + w[0] * whirl[1] - w[1] * whirl[0]};
+  const int on = goes_on(t);
+  for (int c = 0; c < 3; c++) {
+    held[c] = dot(3, t->Q + 3 * c, p);
+    late[c] = (held[c] - t->due[c]) / t->h;
+    t->due[c] = held[c] + t->h * dot(3, t->Q + 3 * c, given);
   }
-}
-
-/* Momenta are due from the force of the body over the step, (6,) in its axes. */
-static void give(const Tissue *t, const double *force) {
-  double u[6];
-  to_space(t, force, u);
-  for (int i = 0; i < 6; i++) t->due[i] += t->h * u[i];
+  for (int c = 0; on && c < 3; c++) t->force[c] += t->Q[c] * late[0] + t->Q[3 + c] * late[1] + t->Q[6 + c] * late[2];
 }
 
 /* Before MuJoCo solves: inertia into its mass matrix, forces into the applied ones. Room: 2 k numbers. */
 void softgrasp_tissue_begin(const Tissue *t, const double *gravity, double *room) {
   const int k = t->k, nv = t->nv;
   double *a = room, *e = room + k, w[3], g[3], W2[9], x[12], y[12], C[9], F[9], load[6], xi[6];
-  double held[6], late[6] = {0}, whirl[6];
   turn(t->Q, nv, t->J, t->six);
   turn(t->Q, nv, t->Jd, t->product);
   for (int r = 0; r < 6; r++) t->b[r] = dot(nv, t->product + (size_t)r * nv, t->qvel);
   for (int r = 0; r < 6; r++) xi[r] = dot(nv, t->six + (size_t)r * nv, t->qvel);
-  integrals(t, t->a, t->e, x, y, C, F);
-  momenta(t, xi, x, y, C, F, held);
-  if (goes_on(t)) missed(t, held, late);
   for (int c = 0; c < 3; c++) {
     w[c] = xi[3 + c] + t->h / 2 * t->rate[c];
     g[c] = t->Q[c] * gravity[0] + t->Q[3 + c] * gravity[1] + t->Q[6 + c] * gravity[2];
@@ -205,16 +183,7 @@ void softgrasp_tissue_begin(const Tissue *t, const double *gravity, double *room
   integrals(t, a, e, x, y, C, F);
   modes(t, g, W, W2);
   body(t, g, W, W2, x, y, C, F);
-  memcpy(load, t->force, 6 * sizeof(double));
-  cross(x, g, load + 3); /* weight is no force of the body */
-  for (int r = 0; r < 6; r++) {
-    whirl[r] = dot(3, t->rigid + 6 * r + 3, xi + 3);
-    t->force[r] += late[r];
-  }
-  cross(xi + 3, whirl, load);
-  cross(xi + 3, whirl + 3, load + 3);
-  memcpy(t->due, held, 6 * sizeof(double));
-  give(t, load);
+  settle_momentum(t, xi);
   for (int r = 0; r < 6; r++) {
     load[r] = t->force[r] + dot(6, t->inertia + 6 * r, t->b);
     for (int n = 0; n < nv; n++) {
@@ -235,7 +204,7 @@ void softgrasp_tissue_begin(const Tissue *t, const double *gravity, double *room
 int softgrasp_tissue_end(const Tissue *t, double *room) {
   const int k = t->k, nv = t->nv;
   int finite = 1;
-  double A[6], force[6];
+  double A[6], force[3];
   memcpy(t->applied, t->user, nv * sizeof(double));
   for (int n = 0; n < nv; n++) t->before[n] = (t->qvel[n] - t->before[n]) / t->h;
   for (int r = 0; r < 6; r++) A[r] = t->b[r] + dot(nv, t->six + (size_t)r * nv, t->before);
@@ -248,12 +217,9 @@ int softgrasp_tissue_end(const Tissue *t, double *room) {
     t->past[i] = change;
   }
   memcpy(t->rate, A + 3, 3 * sizeof(double));
-  for (int r = 0; r < 6; r++) {
-    const double pulled = dot(6, t->inertia + 6 * r, A);
-    t->wrench[r] = -(t->force[r] + pulled);
-    force[r] = pulled + dot(6, t->rigid + 6 * r, A);
-  }
-  give(t, force);
+  for (int r = 0; r < 6; r++) t->wrench[r] = -(t->force[r] + dot(6, t->inertia + 6 * r, A));
+  for (int c = 0; c < 3; c++) force[c] = dot(6, t->inertia + 6 * c, A) + dot(6, t->rigid + 6 * c, A);
+  for (int c = 0; c < 3; c++) t->due[c] += t->h * dot(3, t->Q + 3 * c, force);
   double *r = t->reached;
   *r = 1;
   memcpy(r + 1, t->qpos, t->nq * sizeof(double));

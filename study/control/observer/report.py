@@ -64,7 +64,7 @@ def sentence(study: ObservedStudy) -> str:
     of = "" if loop.complete else f" of the lowest {len(loop.plant.omega)} modes"
     proof = ""
     if not loop.complete:
-        proof = f" The small gain of the other modes, {judged.small_gain:.2g}, is below {SAFE:g}: this is proved."
+        proof = f" The other modes leave it stable: their small gain, {judged.small_gain:.2g}, is below {SAFE:g}."
     return (
         f"The full plant under the observer of {N} states is stable: its abscissa{of} is {judged.abscissa:.4g} 1/s, "
         f"with the state known {judged.abscissa_known:.4g} 1/s.{proof} With the disturbances the cost is "
