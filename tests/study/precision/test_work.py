@@ -256,7 +256,7 @@ def test_what_nothing_meets_is_said_with_what_came_closest(
     study = study_scene(make_scene(SMALL), comm, folder / "cache", Request(1e-9))
     answer = study.answers[0]
     assert not answer.met
-    assert "Nothing tried meets 1e-09" in answer.sentences[0]
+    assert "Nothing tried meets 1e-07 %" in answer.sentences[0]
     assert answer.closest is not None
     errors = [p.error for points in study.points.values() for p in points if p.question != "bases" and p.ok]
     assert answer.closest.point.error == min(errors)
