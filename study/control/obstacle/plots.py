@@ -221,11 +221,10 @@ def figure_gaps(planned: PlannedControl, out_png: Path) -> tuple[Path, ...]:
         gaps.axhline(margin, **LIMIT, label="clearance and margins")
         gaps.set_ylabel("gap [m]")
         gaps.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5)
-        for j, (axis, _) in enumerate(freedoms(planned)):
-            force.plot(
-                run.times[:-1][thin], run.inputs[thin, j], color=style.CYCLE[j % 4], label=axis, drawstyle="steps-post"
-            )
-            speed.plot(run.times[thin], run.v_s[thin, j], color=style.CYCLE[j % 4], label=axis)
+        for j, (axis, turning) in enumerate(freedoms(planned)):
+            look: dict[str, Any] = {"color": style.CYCLE[j % 4], "ls": ":" if turning else "-", "label": axis}
+            force.plot(run.times[:-1][thin], run.inputs[thin, j], drawstyle="steps-post", **look)
+            speed.plot(run.times[thin], run.v_s[thin, j], **look)
         for ax, limit in ((force, task.limits.force), (speed, task.limits.speed)):
             for level in () if limit is None else np.unique(np.atleast_1d(limit)):
                 ax.axhline(level, **LIMIT)
