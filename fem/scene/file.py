@@ -37,8 +37,14 @@ _EXPECTED = {
     "string_pattern_mismatch": "in one line without $ and \\",
 }
 
+ALIKE = 0.65  # least likeness of a key that is suggested [1]; "stiffness" and "tissue" have 0.53
 PART = 4  # letters of a part of a name that is recognised
 TABLES = 2  # most tables with a key of one name, for which another table is suggested [1]
+_OTHER_WORDS = {  # words of the field for a key
+    "stiffness": "tissue.material.young", "modulus": "tissue.material.young", "e": "tissue.material.young",
+    "young": "tissue.material.young", "poisson": "tissue.material.poisson", "nu": "tissue.material.poisson",
+    "density": "tissue.material.rho", "degree": "tissue.order", "dt": "time.steps",
+}  # fmt: skip
 _FORMS = {
     "effects.gravity": "gravity = { g = [0, -9.81] }",
     "effects.damping": 'damping = { kind = "kelvin-voigt", beta = 0.01 }',
@@ -298,9 +304,13 @@ def _suggest(path: Sequence[str]) -> str:
     known = _fields(path[:-1])
     if path[-2:-1] == ["material"]:
         known = known | {"young": (float, ""), "poisson": (float, "")}
+    if meant := _OTHER_WORDS.get(path[-1].lower()):
+        table = [*path[:-1], "material"] if "material" in known else path[:-1]
+        own = table[-1:] == ["material"] == meant.split(".")[-2:-1]  # that of the layer
+        return f"did you mean {'.'.join([*table, meant.rpartition('.')[2]]) if own else meant}?"
     if len(path) == 1 and (below := next((p for p in _below() if p[-1] == path[0]), None)):
         return f"did you mean {'.'.join(below)}?"
-    near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(path[-1], known, n=1, cutoff=ALIKE)
     near = near or [name for name in known if _akin(path[-1], name)]
     if near:
         return f"did you mean {'.'.join([*path[:-1], near[0]])}?"

@@ -145,8 +145,7 @@ class Potential:
 
     def discrete(self, w: Array) -> tuple[Array | None, int]:
         """f_alg of the step from a to a + 2 w, (k,), and -1; or None and a point with J <= 0."""
-        if self._start is None:
-            raise RuntimeError("begin a step first")
+        assert self._start is not None  # begin() comes first
         with np.errstate(invalid="ignore", divide="ignore"):
             P, J = self.law.step(self._start, self.gradient(w), self.lam, self.mu)
         if self.comm is not None and self.comm.allreduce(P is None, MPI.LOR):

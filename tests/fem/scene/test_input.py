@@ -175,3 +175,23 @@ def test_a_long_sentence_keeps_its_ends() -> None:
     assert text.endswith("end")
     assert " ... " in text
     assert str(SceneError("as it was")) == "as it was"
+
+
+@pytest.mark.parametrize(
+    ("override", "text"),
+    [
+        ("stiffness=1", "stiffness is not a key; did you mean tissue.material.young?"),
+        ("tissue.layers.fat.E=1", "tissue.layers.fat.E is not a key; did you mean tissue.layers.fat.material.young?"),
+        # not mu, which is one letter away
+        ("tissue.material={nu=1.0}", "tissue.material.nu is not a key; did you mean tissue.material.poisson?"),
+        (
+            "tissue.layers.fat.material={density=1.0}",
+            "fat.material.density is not a key; did you mean tissue.layers.fat.material.rho?",
+        ),
+        ("control.dt=1", "control.dt is not a key; did you mean time.steps?"),
+        # half of its letters are those of mesh
+        ("tissue.elements=1", "tissue.elements is not a key; keys of tissue are size, origin, "),
+    ],
+)
+def test_hint_for_a_key_that_others_use(override: str, text: str) -> None:
+    assert text in sentence(lambda: load_scene(shipped_scenes()["layers_2d"], [override]))
