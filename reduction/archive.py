@@ -134,6 +134,9 @@ def load(
 ) -> ReducedModel | StrainModel | TurningModel | ContactModel:
     """Read a reduced model of any kind. Collective over ``layout.comm``; without a layout each caller for itself.
 
+    Of a certified model it reads the larger basis alone, a model without certificate;
+    :func:`softgrasp.reduction.certified.archive.load_certified` reads the whole.
+
     Args:
         path: file of :func:`save`.
         layout: where the reconstruction goes, by node coordinates: any rank count; None leaves it out (online use).

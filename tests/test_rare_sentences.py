@@ -5,6 +5,7 @@ The failure is made by hand below the call that has to name it.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
@@ -26,6 +27,7 @@ from softgrasp.fem.energy.rest import affine_parameters
 from softgrasp.fem.errors import SoftgraspError, SolverError
 from softgrasp.fem.mesh import foreign
 from softgrasp.fem.solve import cholesky
+from softgrasp.fem.strain.laws import LAWS
 from softgrasp.lqr.constrained import online as program
 from softgrasp.lqr.design import observer
 from softgrasp.lqr.design import online as planned
@@ -62,7 +64,7 @@ def dead_reader(folder: Path, patch: pytest.MonkeyPatch) -> None:
     """A mesh whose format kills the process that reads it."""
     path = folder / "a.med"
     path.write_text("")
-    patch.setattr(foreign.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=-11))
+    patch.setattr("subprocess.run", lambda *_, **__: SimpleNamespace(returncode=-11))
     foreign.read_foreign(path)
 
 
@@ -77,15 +79,20 @@ def raced(folder: Path, patch: pytest.MonkeyPatch) -> None:
     """Another machine locks the folder between two system calls."""
     patch.setattr(owned, "_held", None)
     patch.setattr(owned, "_check_ended", lambda *_: None)
-    handle = owned.os.open
-    patch.setattr(owned.os, "open", lambda path, flags, *mode: raised(FileExistsError())() if flags & owned.os.O_EXCL
-                  else handle(path, flags, *mode))  # fmt: skip
+    handle = os.open
+
+    def taken(path: Any, flags: int, *mode: int) -> int:
+        if flags & os.O_EXCL:
+            raise FileExistsError
+        return handle(path, flags, *mode)
+
+    patch.setattr("os.open", taken)
     owned.hold(folder / "out")
 
 
 def no_memory(*_: Any) -> None:
     """PETSc's error 55, as a factor that does not fit raises it."""
-    cholesky._factored(SimpleNamespace(setUp=raised(PETSc.Error(55))))  # type: ignore[arg-type]
+    cholesky._factored(SimpleNamespace(setUp=raised(PETSc.Error(55))))
 
 
 def sagging(force: float) -> Act:
@@ -101,7 +108,7 @@ def no_room(*_: Any) -> None:
     """The compiled steps find no memory."""
     ffi = SimpleNamespace(new=lambda _: [0, 0, 0], cast=lambda *_: 0)
     lib = SimpleNamespace(softgrasp_march=lambda *_: -1)
-    cells = SimpleNamespace(law=next(iter(stepper.LAWS)))
+    cells = SimpleNamespace(law=next(iter(LAWS)))
     potential = SimpleNamespace(packed=[E, E], cells=cells, d=2, rounding=0.0)
     problem: Any = SimpleNamespace(potential=potential, S=E, dt=0.1)
     try:

@@ -9,7 +9,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.shown import percent
+from softgrasp.fem.shown import Card, Shown, percent
 from softgrasp.reduction.online import ReducedTrajectory
 
 Kind = Literal["proof", "estimate"]
@@ -155,9 +155,13 @@ class Certificate:
         return f"reduction {percent(self.reduction)} ({self.how}) | time step {step} | mesh {mesh}"
 
 
-@dataclass(frozen=True)
-class CertifiedRun:
+@dataclass(frozen=True, repr=False)
+class CertifiedRun(Shown):
     """A reduced run and what is known of its error."""
 
     trajectory: ReducedTrajectory  # reduced run
     certificate: Certificate  # its errors
+
+    def card(self) -> Card:
+        """Steps, size and outputs of the run, and its errors."""
+        return Card("Certified run", (*self.trajectory.card().rows, ("error", self.certificate.sentence())))

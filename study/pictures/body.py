@@ -296,8 +296,10 @@ def _tripod(ax: Any, move: MoveView) -> None:
         arm = {"arrowstyle": "-", "lw": 0.8, "shrinkA": 0, "shrinkB": 0}
         ax.annotate("", foot + end, foot, arrowprops=arm, annotation_clip=False)
         ax.annotate(name, foot + end, 5 * end / np.linalg.norm(end), textcoords="offset points", **look)
-    text = f"{length:g} m each"
-    ax.annotate(text, foot + low, (0, -9), textcoords="offset points", va="top", annotation_clip=False)
+    # below the arms, or beside the highest where the first body stands below
+    at, shift = (ends[2], (9, 5)) if corner == "top" else (low, (0, -13))
+    look |= {"ha": "left"}
+    ax.annotate(f"{length:g} m each", foot + at, shift, textcoords="offset points", **look)
 
 
 def name_layers(ax: Any, move: MoveView, u: Array, *, inside: bool = False) -> None:

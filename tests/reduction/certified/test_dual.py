@@ -98,6 +98,8 @@ def test_a_file_keeps_the_duals(comm: MPI.Intracomm, mpi_tmp_path: Any) -> None:
     _, certified = made(comm, KELVIN_VOIGT)
     save_certified(certified, mpi_tmp_path / "duals.h5")
     again = load_certified(mpi_tmp_path / "duals.h5")
-    a, b = (m.run(allow=True).certificate.outputs.values for m in (certified, again))
+    one, two = (m.run(allow=True) for m in (certified, again))
+    assert two.certificate.sentence() in repr(two)
+    a, b = one.certificate.outputs.values, two.certificate.outputs.values
     assert np.array_equal(a, b)
     assert again.with_sizes(5, 10).duals is None
