@@ -27,12 +27,14 @@ from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.operators import Reconstruction
 from softgrasp.reduction.system import ModelError, Outputs
 from softgrasp.reduction.turning.model import TurningModel
+from softgrasp.reduction.turning.strained import TurningFiner, TurningStrainModel
 
 if TYPE_CHECKING:
     from softgrasp.reduction.strain.model import StrainModel
 
 LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 3"
 TURNING = "softgrasp reduced model in the frame of the hand 1"
+TURNING_STRAIN = "softgrasp reduced model at finite strain in the frame of the hand 1"
 CONTACT = "softgrasp reduced model with contact 1"
 # what h5py and the reading of a model raise of a file that is not whole
 DAMAGE = (OSError, LookupError, TypeError, ValueError, RuntimeError, AttributeError, MemoryError)
@@ -56,6 +58,7 @@ STRAIN_ARRAYS = {
     "parts": ("K_mu", "K_lambda", "G"),
 }
 FINER_ARRAYS = ("K_mu", "K_lambda", "G", "gram")
+FRAME_KEYS, FRAME_ARRAYS, PAIRS = ("sizes", "hand_weight"), ("S", "E", "M_hand", "rigid"), ("S", "E")  # with a frame
 # fields whose key in a file is another word
 FIELDS = {"tau": "cubature_tolerance", "residual": "cubature_residual", "reach": "largest_coordinates"}
 
@@ -90,6 +93,8 @@ def save(model: ReducedModel | StrainModel | TurningModel | ContactModel, path: 
         kind, reconstruction = LINEAR, model.reconstruction
     else:
         kind, reconstruction = TURNING if isinstance(model, TurningModel) else STRAIN, None
+        if isinstance(model, TurningStrainModel):
+            kind = TURNING_STRAIN
         if model.Phi is not None and model.layout is not None:
             reconstruction = Reconstruction(model.layout, model.Phi, model.Phi[:, :0])
     write_model(Path(path), kind, about(model), reconstruction, partial(write_small, model))
@@ -98,7 +103,8 @@ def save(model: ReducedModel | StrainModel | TurningModel | ContactModel, path: 
 def about(model: ReducedModel | StrainModel | TurningModel) -> dict[str, Any]:
     """Description of a model in JSON, for its file."""
     linear = isinstance(model, ReducedModel)
-    keys = LINEAR_KEYS if linear else TURNING_KEYS if isinstance(model, TurningModel) else STRAIN_KEYS
+    keys: tuple[str, ...] = LINEAR_KEYS if linear else TURNING_KEYS if isinstance(model, TurningModel) else STRAIN_KEYS
+    keys += FRAME_KEYS if isinstance(model, TurningStrainModel) else ()
     data: dict[str, Any] = {key: getattr(model, FIELDS.get(key, key)) for key in keys}
     data |= {"materials": [asdict(m) for m in model.materials], "names": list(model.outputs.names)}
     return data if isinstance(model, ReducedModel | TurningModel) else data | {"law": model.cells.law}
@@ -118,8 +124,12 @@ def write_small(model: ReducedModel | StrainModel | TurningModel, file: h5py.Fil
             }
             for group, keys in STRAIN_ARRAYS.items()
         }
+        if isinstance(model, TurningStrainModel):
+            groups["hand"] = {key: getattr(model, key) for key in FRAME_ARRAYS}
         if model.finer is not None:
             groups["finer"] = {key: getattr(model.finer, key) for key in FINER_ARRAYS}
+            if isinstance(model.finer, TurningFiner):
+                groups["finer"] |= {key: getattr(model.finer, key) for key in PAIRS}
             groups["finer/cells"] = {key: getattr(model.finer.cells, key) for key in STRAIN_ARRAYS["cells"]}
     for group, arrays in groups.items():
         for key, value in arrays.items():
@@ -157,7 +167,8 @@ def load(
             return read_contact(file, data, layout, V)
         if file.attrs["format"] == TURNING:
             return read_turning(file, data, layout)
-        return (read_strain if file.attrs["format"] == STRAIN else read_linear)(file, data, layout)
+        strained = file.attrs["format"] in (STRAIN, TURNING_STRAIN)
+        return (read_strain if strained else read_linear)(file, data, layout)
 
 
 def read_linear(file: h5py.File, data: dict[str, Any], layout: BlockLayout | None) -> ReducedModel:
@@ -179,13 +190,19 @@ def read_strain(file: h5py.File, data: dict[str, Any], layout: BlockLayout | Non
     shared, law = _read_shared(file, data), data.pop("law")
     data = {FIELDS.get(key, key): value for key, value in data.items()}
     Phi = None if layout is None else np.asarray(read_reconstruction(file, layout).L_q)
-    finer = None
+    finer, frame = None, dict[str, Any]()
+    made: type[StrainModel] = StrainModel
+    of: type[Finer] = Finer
+    more: tuple[str, ...] = FINER_ARRAYS
+    if file.attrs["format"] == TURNING_STRAIN:
+        made, of, more = TurningStrainModel, TurningFiner, (*FINER_ARRAYS, *PAIRS)
+        frame = {key: file[f"hand/{key}"][()] for key in FRAME_ARRAYS} | {"sizes": tuple(data.pop("sizes"))}
     if "finer" in file:
         sampled = Cells(law, **{key: file[f"finer/cells/{key}"][()] for key in STRAIN_ARRAYS["cells"]})
-        finer = Finer(sampled, **{key: file[f"finer/{key}"][()] for key in FINER_ARRAYS})
-    return StrainModel(
+        finer = of(sampled, **{key: file[f"finer/{key}"][()] for key in more})
+    return made(
         cells=Cells(law, **cells), box=TrainingDomain(**box), **parts, **shared, **data, layout=layout, Phi=Phi,
-        finer=finer,
+        finer=finer, **frame,
     )  # fmt: skip
 
 
@@ -276,7 +293,7 @@ def reading(
     with raise_on_all_ranks(comm):
         try:
             with h5py.File(no_pipe(path), "r") as file:
-                if file.attrs.get("format") not in (LINEAR, STRAIN, TURNING, CONTACT):
+                if file.attrs.get("format") not in (LINEAR, STRAIN, TURNING, TURNING_STRAIN, CONTACT):
                     raise ModelError(f"{path} is no reduced model of this version ({LINEAR!r}); reduce the scene again")
                 # one rank reads a reconstruction twice, not all of them
                 for rows in (False, True) if layout is not None and comm.rank == 0 else (False,):

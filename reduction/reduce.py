@@ -70,7 +70,8 @@ def reduce(
             "psd_cotangent_lift", "psd_svd_like" and their "_fixed" and "_relative" forms, or "craig_bampton"; all keys
             in :data:`softgrasp.reduction.bases.registry.METHODS`. None is the paper's PSD with fixed solid modes
             "psd_fixed" [SBRH21]; at finite strain there is one basis only, the cotangent lift. With effects.frame it is
-            "craig_bampton" (None too) or "psd_cotangent_lift_fixed_relative".
+            "craig_bampton" (None too) or "psd_cotangent_lift_fixed_relative"; both effects: no method, a led hand, see
+            :class:`softgrasp.reduction.turning.strained.TurningStrainModel`.
         N: dimension, the hand's 2 n_s included. Linear models also accept a rule, and None, which keeps 99.9 % of the
             energy as the paper does.
         inner: inner product of the snapshots, see :func:`softgrasp.reduction.bases.registry.make_basis`; linear only.
@@ -92,7 +93,7 @@ def reduce(
     if not isinstance(runs, Trajectory | FullRun | Sequence):
         raise ReductionError(f"{shortened(repr(runs))} is no run; give what softgrasp.simulate returns, or a list")
     fulls = [as_full(model, run) for run in ([runs] if isinstance(runs, Trajectory | FullRun) else runs)]
-    if model.system.frame is not None:
+    if model.system.frame is not None and model.system.points is None:
         from softgrasp.reduction.turning.projection import reduce_turning
 
         return reduce_turning(model, fulls, method or "craig_bampton", N, inner, engine)
@@ -104,6 +105,10 @@ def reduce(
         raise ReductionError(
             f"scene {model.scene.name} has effects.finite_strain, whose models have one basis; give N alone"
         )
+    if model.system.frame is not None:
+        from softgrasp.reduction.turning.strained_training import train_turning
+
+        return train_turning(model, fulls, int(N)).reduce(int(N))
     return train(model, fulls, int(N)).reduce(int(N))
 
 

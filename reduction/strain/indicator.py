@@ -39,7 +39,14 @@ class Finer:
     gram: Array  # Phi' Phi, (K, K)
 
 
-def estimated_error(problem: StrainProblem, gram: Array, load: Array, weight: Array, run: tuple[Array, Array]) -> float:
+Turning = Callable[[np.ndarray], tuple[Array, Array, Array]]
+"""In the frame of a hand, at steps (m,): inertia instead of v' (m, K), what is added to D and to K(t), (m, K, K)."""
+
+
+def estimated_error(
+    problem: StrainProblem, gram: Array, load: Array, weight: Array, run: tuple[Array, Array],
+    turning: Turning | None = None,
+) -> float:  # fmt: skip
     """|E|_F / |A + E|_F of a run in the finer problem; infinite where the run folds its cells.
 
     Args:
@@ -48,6 +55,7 @@ def estimated_error(problem: StrainProblem, gram: Array, load: Array, weight: Ar
         load: of the finer problem at the midpoints, (steps, K).
         weight: of the body, (K,); the run starts in equilibrium with it unless a[0] = 0.
         run: a, v, coordinates and their rates, (steps + 1, k) each.
+        turning: see :data:`Turning`; None where the hand does not turn.
     """
     a, v = run
     K, k, dt, potential = len(gram), a.shape[1], problem.dt, problem.potential
@@ -55,10 +63,12 @@ def estimated_error(problem: StrainProblem, gram: Array, load: Array, weight: Ar
     middle = (edges[1:] + edges[:-1] - 1) // 2
     more = [(0, 0), (0, K - k)]
     at, half = (np.pad(x, more) for x in (a[middle], (a[middle + 1] - a[middle]) / 2))
-    change = np.pad((v[middle + 1] - v[middle]) / dt, more)
+    change, gyro, spun = np.pad((v[middle + 1] - v[middle]) / dt, more), np.zeros((1, K, K)), np.zeros((1, K, K))
+    if turning is not None:
+        change, gyro, spun = turning(middle)
     with np.errstate(invalid="ignore", divide="ignore"):
         r = load[middle] - change - 2 / dt * half @ problem.D - potential.discrete_forces(at, half)
-        tangents = _between(potential.tangents, at + half)
+        tangents = _between(potential.tangents, at + half) + spun
         e = np.zeros(K)
         if a[0].any():
             start = np.pad(a[:1], more)
@@ -66,7 +76,7 @@ def estimated_error(problem: StrainProblem, gram: Array, load: Array, weight: Ar
     if not (np.isfinite(r).all() and np.isfinite(tangents).all() and np.isfinite(e).all()):
         return float("inf")
     s = 2 / (np.diff(edges) * dt)
-    inverse = np.linalg.inv(s[:, None, None] ** 2 * np.eye(K) + s[:, None, None] * problem.D + tangents)
+    inverse = np.linalg.inv(s[:, None, None] ** 2 * np.eye(K) + s[:, None, None] * (problem.D + gyro) + tangents)
     # w = response [e; e'] + pushed, all intervals at once
     response = np.concatenate([-inverse @ tangents, s[:, None, None] * inverse], axis=2)
     pushed = (inverse @ r[:, :, None])[:, :, 0]

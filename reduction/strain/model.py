@@ -9,7 +9,7 @@ constants, accelerations of the hand, and the coordinates that its training runs
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -158,12 +158,14 @@ class ReducedStrainSystem(Shown):
         finer, dt = self.model.finer, self.problem.dt
         return None if finer is None else strain_problem(finer, self.materials, self.model.alpha, dt)
 
-    def equilibrium(self) -> Array:
+    def equilibrium(self, q: Array | None = None) -> Array:
         """The a with dW_r/da = G g, by Newton's method under growing load, (k,).
+
+        ``q``: place of the hand (n_s,), which counts where gravity turns with it; None is zero.
 
         Raises ModelError: there is none within reach.
         """
-        potential, full = self.problem.potential, self.model.G @ self.gravity
+        potential, full = self.problem.potential, self.model.G @ self.fall(q)
         a = np.zeros(len(full))
         for share in np.linspace(0, 1, LOAD_STEPS + 1)[1:] if full.any() else ():
             for _ in range(NEWTON_STEPS):
@@ -177,6 +179,10 @@ class ReducedStrainSystem(Shown):
             else:
                 raise ModelError("Newton's method found no equilibrium of the reduced body under gravity")
         return a
+
+    def fall(self, q: Array | None) -> Array:
+        """Acceleration of free fall that tissue of a hand at q (n_s,) feels, (n_s,)."""
+        return self.gravity
 
     def run(
         self, hand: tuple[Array, Array], *, a0: Array | None = None, tol: float = TOLERANCE, engine: str = ""
@@ -324,6 +330,23 @@ class StrainModel(Shown):
         own = self.gravity if gravity is None else np.asarray(gravity, dtype=float)
         g = np.zeros(self.G.shape[1]) if own is None else own
         return ReducedStrainSystem(self, strain_problem(self, materials, self.alpha, dt), materials, g, outside)
+
+    def leading(self, k: int) -> StrainModel:
+        """The model of the first k displacements: bases are nested."""
+        return replace(
+            self,
+            cells=self.cells.leading(k),
+            K_mu=self.K_mu[:, :k, :k],
+            K_lambda=self.K_lambda[:, :k, :k],
+            G=self.G[:k],
+            outputs=replace(self.outputs, C_z=self.outputs.C_z[:, :k]),
+            box=replace(self.box, largest_coordinates=self.box.largest_coordinates[:k]),
+            Phi=None if self.Phi is None else self.Phi[:, :k],
+        )
+
+    def finer_space(self, cells: Cells, gram: Array) -> Finer:
+        """The columns of this model as the space in which answers of smaller ones are checked, on these cells."""
+        return Finer(cells, self.K_mu, self.K_lambda, self.G, gram)
 
     def displacement(self, a: Array) -> Array:
         """Deformation z = Phi a, local rows (n_local, m), of coordinates (m, k).

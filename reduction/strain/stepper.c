@@ -163,17 +163,18 @@ static int solve(Body *b, const double *S, const double *h, double tol, double r
   return 1;
 }
 
-/* counts: evaluations, restarts, point with J <= 0 of a failure. Returns 0, step + 1 that failed, or -1 without memory. */
+/* past: scale of the residual, w of the last step and of the one before, kept from call to call.
+   counts: evaluations, restarts, point with J <= 0 of a failure. Returns 0, step + 1 that failed, or -1 without memory. */
 int softgrasp_march(int law, int d, int k, int p, const double *B, const double *weight, const double *lam,
                     const double *mu, const double *S, double s, const double *load, int steps, double tol,
-                    double rounding, double *J, double *A, double *V, long *counts) {
+                    double rounding, double *J, double *A, double *V, double *past, long *counts) {
   const int n = d * d, chunks = p / LANES;
   Lane *lanes = calloc((size_t)((n + 2) * chunks + k), sizeof(Lane));
-  double *room = calloc((size_t)(11 * k + k * k), sizeof(double));
+  double *room = calloc((size_t)(9 * k + k * k), sizeof(double));
   if (!room || !lanes) return free(room), free(lanes), -1;
   Body b = {law, d, k, p, B, weight, lam, mu, lanes, lanes + n * chunks, lanes + (n + 1) * chunks,
             lanes + (n + 2) * chunks, 0, -1};
-  double *h = room, *w = h + k, *older = w + k, *old = older + k, *at = old + k, scale = 0;
+  double *h = room, *w = h + k, *at = w + k, *old = past + 1, *older = old + k;
   int failed = 0;
   for (int t = 0; t < steps && !failed; t++) {
     const double *a = A + t * k, *v = V + t * k;
@@ -181,7 +182,7 @@ int softgrasp_march(int law, int d, int k, int p, const double *B, const double 
     if (d == 2) begin_as(&b, 2, a);
     else begin_as(&b, 3, a);
     for (int i = 0; i < k; i++) h[i] = s * v[i] + load[t * k + i], w[i] = 2 * old[i] - older[i];
-    if (!solve(&b, S, h, tol, rounding, &scale, J, w, at, counts + 1)) failed = t + 1;
+    if (!solve(&b, S, h, tol, rounding, past, J, w, at, counts + 1)) failed = t + 1;
     for (int i = 0; i < k; i++) {
       a1[i] = a[i] + 2 * w[i], v1[i] = 2 * s * w[i] - v[i];
       older[i] = old[i], old[i] = w[i];

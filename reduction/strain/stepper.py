@@ -26,7 +26,7 @@ from softgrasp.reduction.strain.cells import Potential
 SOURCE = Path(__file__).with_name("stepper.c")
 DECLARATION = """int softgrasp_march(int law, int d, int k, int p, const double *B, const double *weight,
   const double *lam, const double *mu, const double *S, double s, const double *load, int steps, double tol,
-  double rounding, double *J, double *A, double *V, long *counts);"""
+  double rounding, double *J, double *A, double *V, double *past, long *counts);"""
 MOST, HALVINGS, RENEWALS = 15, 10, 3  # iterations before a fresh tangent, halvings of a correction, fresh tangents
 GROWTH = 4.0  # of the residual, above which a correction is refused
 
@@ -71,17 +71,63 @@ def march_strain(problem: StrainProblem, load: Array, a0: Array, v0: Array, tol:
     steps, k = load.shape
     A, V = np.zeros((steps + 1, k)), np.zeros((steps + 1, k))
     A[0], V[0] = a0, v0
-    library = None if engine == "NumPy" or problem.potential.comm is not None else compiled()
-    if engine == "C" and library is None:
-        raise SolverError("the compiled stepper is not available here; leave the engine out")
-    J = np.linalg.inv(problem.S + problem.K)
+    library, J = _chosen(problem, engine), np.linalg.inv(problem.S + problem.K)
     if library is not None:
-        failed, counts = _march_c(library, problem, load, tol, J, A, V)
+        failed, counts = _march_c(library, problem, problem.S, load, tol, J, A, V, np.zeros(2 * k + 1))
     else:
         failed, counts = _March(problem, tol, J).run(load, A, V)
     if failed:
         raise SolverError(_sentence(problem, failed - 1, counts[2]))
     return March(A, V, counts[0] / max(steps, 1), counts[1], "NumPy" if library is None else "C")
+
+
+class StepSolver:
+    """Single steps S w + f_alg(a, w) = h whose S changes, with all that the next one starts from.
+
+    Attributes:
+        engine: "C" or "NumPy".
+        evaluations: of the force so far.
+        restarts: fresh tangents so far.
+    """
+
+    def __init__(self, problem: StrainProblem, tol: float, engine: str = "") -> None:
+        self.problem, self.tol, self.library = problem, tol, _chosen(problem, engine)
+        self.engine = "NumPy" if self.library is None else "C"
+        self.J, k = np.linalg.inv(problem.S + problem.K), len(problem.K)
+        self.past, self.steps, self.evaluations, self.restarts = np.zeros(2 * k + 1), 0, 0, 0
+        self._numpy = _March(problem, tol, self.J)
+
+    def solve(self, a: Array, S: Array, h: Array) -> Array:
+        """The w of a step from a (k,), S (k, k) and h (k,). Collective if the potential is.
+
+        Raises SolverError: no convergence; names step, time, cell and law.
+        """
+        k, past = len(a), self.past
+        if self.library is not None:
+            A, V = np.vstack([a, np.zeros(k)]), np.zeros((2, k))
+            failed, counts = _march_c(self.library, self.problem, S, h[None], self.tol, self.J, A, V, past)
+            self.evaluations, self.restarts = self.evaluations + counts[0], self.restarts + counts[1]
+        else:
+            march = self._numpy
+            march.potential.begin(a)
+            march.S, march.h = S, h
+            w = march.solve(2 * past[1 : k + 1] - past[k + 1 :])
+            failed, counts = w is None, march.counts
+            self.evaluations, self.restarts = counts[:2]
+            if w is not None:
+                past[1:] = np.concatenate([w, past[1 : k + 1]])
+        if failed:
+            raise SolverError(_sentence(self.problem, self.steps, counts[2]))
+        self.steps += 1
+        return past[1 : k + 1].copy()
+
+
+def _chosen(problem: StrainProblem, engine: str) -> Any:
+    """The compiled stepper, or None for NumPy. Raises SolverError: it is asked for and not available."""
+    library = None if engine == "NumPy" or problem.potential.comm is not None else compiled()
+    if engine == "C" and library is None:
+        raise SolverError("the compiled stepper is not available here; leave the engine out")
+    return library
 
 
 def _sentence(problem: StrainProblem, step: int, point: int) -> str:
@@ -96,7 +142,9 @@ def _sentence(problem: StrainProblem, step: int, point: int) -> str:
     )
 
 
-def _march_c(library: Any, problem: StrainProblem, load: Array, tol: float, J: Array, A: Array, V: Array) -> Any:
+def _march_c(
+    library: Any, problem: StrainProblem, S: Array, load: Array, tol: float, J: Array, A: Array, V: Array, past: Array
+) -> Any:
     ffi, lib = library
     potential = problem.potential
     counts = ffi.new("long[3]")
@@ -104,12 +152,12 @@ def _march_c(library: Any, problem: StrainProblem, load: Array, tol: float, J: A
     def pointer(x: Array) -> Any:
         return ffi.cast("double *", x.ctypes.data)
 
-    arrays = [*potential.packed, np.ascontiguousarray(problem.S)]
+    arrays = [*potential.packed, np.ascontiguousarray(S)]
     load = np.ascontiguousarray(load)
     failed = lib.softgrasp_march(
         list(LAWS).index(potential.cells.law), potential.d, load.shape[1], len(potential.packed[1]),
         *map(pointer, arrays), 2 / problem.dt, pointer(load), len(load), tol, potential.rounding, pointer(J),
-        pointer(A), pointer(V), counts,
+        pointer(A), pointer(V), pointer(past), counts,
     )  # fmt: skip
     if failed < 0:
         raise MemoryError("the reduced run does not fit into memory")
@@ -129,7 +177,7 @@ class _March:
         for n, now in enumerate(load):
             self.potential.begin(A[n])
             self.h = self.s * V[n] + now
-            w = self._solve(2 * old - older)
+            w = self.solve(2 * old - older)
             if w is None:
                 return n + 1, self.counts
             A[n + 1], V[n + 1] = A[n] + 2 * w, 2 * self.s * w - V[n]
@@ -144,7 +192,8 @@ class _March:
             return None
         return np.asarray(self.S @ w + f - self.h)
 
-    def _solve(self, w: Array) -> Array | None:
+    def solve(self, w: Array) -> Array | None:
+        """The w of one step from a guess; None without convergence."""
         R = self._residual(w)
         if R is None:
             w = np.zeros_like(w)

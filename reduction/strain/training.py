@@ -42,7 +42,7 @@ from softgrasp.reduction.parameters import thinned
 from softgrasp.reduction.projection import project_outputs
 from softgrasp.reduction.replay import FullRun, check_scenes
 from softgrasp.reduction.strain.cells import Cells, Potential
-from softgrasp.reduction.strain.indicator import COLUMNS, Finer
+from softgrasp.reduction.strain.indicator import COLUMNS
 from softgrasp.reduction.strain.model import ReducedStrainSystem, StrainModel, StrainRun, TrainingDomain, coordinates
 from softgrasp.reduction.strain.nnls import nnls, on_one_rank
 from softgrasp.reduction.system import ModelError
@@ -184,29 +184,24 @@ class Training:
     def _box(self) -> TrainingDomain:
         materials = [run.model.system.materials for run in self.runs]
         lam, mu = (np.array([[getattr(m, key) for m in each] for each in materials]) for key in ("lam", "mu"))
-        g = self.model.system.gravity
-        c = [np.diff(run.trajectory.v_s, axis=0) / run.dt - (0.0 if g is None else g) for run in self.runs]
+        c = [self._felt(run) for run in self.runs]
         least, most = np.min([x.min(axis=0) for x in c], axis=0), np.max([x.max(axis=0) for x in c], axis=0)
         largest = np.max([np.abs(r.a).max(axis=0) for r in self.references], axis=0)
         ends = [np.stack([x.min(axis=0), x.max(axis=0)], axis=1) for x in (lam, mu)]
         load = np.stack([np.minimum(least, 0.0), np.maximum(most, 0.0)], axis=1)
         return TrainingDomain(ends[0], ends[1], load, largest)
 
+    def _felt(self, run: FullRun) -> Array:
+        """Accelerations a_s - g of the hand of a run, (steps, n_s)."""
+        g = self.model.system.gravity
+        return np.asarray(np.diff(run.trajectory.v_s, axis=0) / run.dt - (0.0 if g is None else g))
+
     def leading(self, k: int) -> StrainModel:
         """The model of k displacements on all cells."""
         whole = self.whole
         if not 0 < k <= whole.k:
             raise ReductionError(f"k = {k} must lie between 1 and the {whole.k} columns of the basis")
-        return replace(
-            whole,
-            cells=whole.cells.leading(k),
-            K_mu=whole.K_mu[:, :k, :k],
-            K_lambda=whole.K_lambda[:, :k, :k],
-            G=whole.G[:k],
-            outputs=replace(whole.outputs, C_z=whole.outputs.C_z[:, :k]),
-            box=replace(whole.box, largest_coordinates=whole.box.largest_coordinates[:k]),
-            Phi=self.Phi[:, :k],
-        )
+        return whole.leading(k)
 
     def galerkin(self, k: int) -> tuple[StrainRun, ...]:
         """All training runs of the model on all cells; made once for each k. Collective.
@@ -256,7 +251,7 @@ class Training:
         with self._stage(k, "estimate"):
             further, gram = self.leading(K), self.references[0].flat.gram[:K, :K]
             ((cells, _),) = self._sampled(further.cells, G.reshape(-1, G.shape[2]), [goal])
-            finer = Finer(cells, further.K_mu, further.K_lambda, further.G, gram)
+            finer = further.finer_space(cells, gram)
         goals, models = [goal if tau is None else tau for tau in taus], []
         with self._stage(k, "weights"):
             done = self._sampled(all_cells.cells, G[:, :k].reshape(-1, G.shape[2]), goals)
@@ -374,7 +369,7 @@ def replay_strain(rom: StrainModel, full: FullRun, model: Model | None = None, *
 
 
 def _replay(small: ReducedStrainSystem, full: FullRun) -> StrainRun:
-    a0 = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
+    a0 = small.equilibrium(full.hand[0][0]) if full.model.scene.time.start == "equilibrium" else None
     return small.run(full.hand, a0=a0)
 
 

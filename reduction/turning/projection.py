@@ -10,7 +10,6 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, normalising, times_columns, total
-from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.bases.engines import EngineName
 from softgrasp.reduction.bases.inner import InnerName
 from softgrasp.reduction.bases.registry import find_method, make_basis
@@ -42,13 +41,11 @@ def reduce_turning(
     inner: InnerName | None = None,
     engine: EngineName = "tsqr",
 ) -> TurningModel:
-    """A model of a scene in the frame of the hand, see :func:`softgrasp.reduction.reduce.reduce`. Collective.
+    """A linear model of a scene in the frame of the hand, see :func:`softgrasp.reduction.reduce.reduce`. Collective.
 
     Raises:
-        ReductionError: the scene has finite strain.
         BasisError: the basis has other modes for velocities, or there is none of N columns.
     """
-    refuse_strain(model)
     find_method(method)
     if method not in TURNING_METHODS:
         raise BasisError(
@@ -75,15 +72,6 @@ def reduce_turning(
         system.damping.alpha, system.damping.active, system.hand_weight, system.two_way, system.gravity, system.layout,
         Phi, model.scene_hash, origin_of(model.scene_keys), {"basis": spent[0], "projection": spent[1]},
     )  # fmt: skip
-
-
-def refuse_strain(model: Model) -> None:
-    """Raises ReductionError: the scene has finite strain."""
-    if model.system.points is not None:
-        raise ReductionError(
-            f"scene {model.scene.name} has effects.finite_strain, and a reduced model in the frame of the hand is "
-            "linear; use --set effects.finite_strain=false for its linear law"
-        )
 
 
 def orthonormal(system: BlockSystem, X: Array) -> Array:

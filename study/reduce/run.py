@@ -28,6 +28,8 @@ def check_scene(scene: Scene) -> tuple[str, ...]:
     if scene.effects.frame is not None:
         if scene.reduction.certify != "off" or scene.reduction.train == "greedy":
             scene.refuse_frame("a certified model")
+        if scene.effects.finite_strain is not None:
+            return ()
         from softgrasp.study.reduce.turning.measure import turning_methods  # models of another kind
 
         return turning_methods(scene)
@@ -58,7 +60,7 @@ def run_reduce(
         from softgrasp.study.reduce.certified.run import run_certify  # only certified models pay for it
 
         return run_certify(session, scene)
-    if scene.effects.frame is not None:
+    if scene.effects.frame is not None and scene.effects.finite_strain is None:
         from softgrasp.study.reduce.turning.run import run_turning
 
         return run_turning(session, scene, names)

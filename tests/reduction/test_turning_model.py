@@ -226,5 +226,5 @@ def test_what_it_cannot_do_is_refused(comm: MPI.Intracomm) -> None:
     with pytest.raises(ModelError, match="either the motion of the hand or the force"):
         rom.at(1e-3).run()
     strained = plate(comm, UNDAMPED | {"finite_strain": {}}, steps=10)
-    with pytest.raises(ReductionError, match=r"effects\.finite_strain=false"):
+    with pytest.raises(ReductionError, match="whose models have one basis"):
         sg.reduce(strained, sg.simulate(plate(comm, UNDAMPED, steps=20)), "craig_bampton", N=14)

@@ -98,8 +98,6 @@ SENTENCES: list[tuple[Act, str]] = [
     (reduced(BENT, "reduction.N=[2, 4]"),
      "reduction.N = [2, 4]: a model at finite strain has an even number of columns,"),
     (reduced(BENT, "reduction.methods=['psd']"), "reduction.methods names linear bases; leave it out with "),
-    (lambda folder: run_reduce(Path("turn_over"), folder / "out", SMALL, QUIET),
-     "scene turn_over has effects.finite_strain, and a reduced model in the frame of the hand is linear; use --set "),
     (lambda _: Table(("b", "c"), [(1,)], title="times"), "the table 'times' has 2 columns, but a row has 1"),
     (compared("scene.toml", None),
      "scene.toml cannot be read (it is a pipe; write it to a file first); run the scene "),

@@ -13,6 +13,7 @@ from softgrasp.fem import Model, SceneError, SolverError, Stopwatch, shortened, 
 from softgrasp.reduction import FullRun, ReductionError, StrainModel, full_run
 from softgrasp.reduction.parameters import grid_of, mirrored, moved_to, outside, run_at, training_of
 from softgrasp.reduction.strain.training import Reference, Training, pooled_errors, reference_of, replay_strain, train
+from softgrasp.reduction.turning.strained_training import train_turning
 from softgrasp.study.reduce.strain.result import (
     CELLS_AT,
     HeldOutTest,
@@ -68,11 +69,11 @@ def strain_turns(own: FullRun, rom: StrainModel) -> Turns:
     """Full model and a reduced one in turn, whose answer at a new parameter comes with its estimate. Collective."""
     small, materials = rom.at(own.dt, outside=True), own.model.system.materials
     at_rest = own.model.scene.time.start != "equilibrium"
-    start = None if at_rest else small.equilibrium()
+    start = None if at_rest else small.equilibrium(own.hand[0][0])
 
     def new() -> float:
         other = rom.at(own.dt, materials, outside=True)
-        return other.run(own.hand, a0=None if at_rest else other.equilibrium()).error_estimate
+        return other.run(own.hand, a0=None if at_rest else other.equilibrium(own.hand[0][0])).error_estimate
 
     return in_turn(own.model, lambda: small.run(own.hand, a0=start), new)
 
@@ -137,7 +138,7 @@ def _family(
     training = None
     for N in sorted(sizes, reverse=True):
         try:
-            training = train(model, runs, N)
+            training = (train if model.system.frame is None else train_turning)(model, runs, N)
             break
         except ReductionError as error:
             refused[N] = error.reason
@@ -182,7 +183,7 @@ def _measure(
         worst[kind] += [] if pair is None else [pair[0]]
     full, comm = training.runs[0], training.model.system.layout.comm
     small = rom.at(full.dt, outside=True)  # few cells may overshoot
-    start = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
+    start = small.equilibrium(full.hand[0][0]) if full.model.scene.time.start == "equilibrium" else None
     online = median_processor_seconds(comm, lambda: small.run(full.hand, a0=start), RUNS)
     setup = median_processor_seconds(comm, lambda: rom.at(full.dt).problem.potential.packed, SETUPS)
     estimate = median_processor_seconds(

@@ -82,11 +82,13 @@ def test_table(family: StrainFamily) -> Table:
         return f"{error} ({estimate})"
 
     sizes = [p.N for p in family.points]
+    turns = any(len(family.box.load) > len(t.target) for t in family.tests)
+    unit = "target [m, rad]" if turns else "target [m]"
     rows = [
         (t.kind, f"{t.lam:.4g}", f"{t.mu:.4g}", ", ".join(f"{x:.3g}" for x in t.target), *(missed(t, N) for N in sizes))
         for t in family.tests
     ]
-    return Table(("new", "lambda [Pa]", "mu [Pa]", "target [m]", *(f"N = {N}" for N in sizes)), rows)
+    return Table(("new", "lambda [Pa]", "mu [Pa]", unit, *(f"N = {N}" for N in sizes)), rows)
 
 
 def sentences(study: StrainStudy) -> list[str]:
@@ -100,13 +102,16 @@ def sentences(study: StrainStudy) -> list[str]:
     ]
     for f in study.families:
         lam, mu, load = f.box.lam[0], f.box.mu[0], np.abs(f.box.load).max(axis=1)
+        spin = ""
+        if full.model.system.frame is not None:  # the last row of the box
+            spin, load = f" and an angular velocity up to {load[-1]:.3g} rad/s", load[:-1]
         inside = f"lambda in [{lam[0]:.4g}, {lam[1]:.4g}] and mu in [{mu[0]:.4g}, {mu[1]:.4g}] Pa"
         if f.key == "own" and lam[0] == lam[1] and mu[0] == mu[1]:
             inside = f"lambda = {lam[0]:.4g}, mu = {mu[0]:.4g} Pa only"
         lines.append(
             f"Models {f.title} ({f.runs} full run{'s' if f.runs > 1 else ''}) answer for {inside} and "
-            f"accelerations of the hand up to {', '.join(f'{x:.3g}' for x in load)} by degree of freedom; they refuse "
-            "what lies outside."
+            f"accelerations of the hand up to {', '.join(f'{x:.3g}' for x in load)} by degree of freedom{spin}; they "
+            "refuse what lies outside."
         )
         errors = {N: [e for t in f.tests if (e := t.errors.get(N)) is not None] for N in f.models}
         best = min(((statistics.median(e), N) for N, e in errors.items() if e), default=None)

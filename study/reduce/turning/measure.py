@@ -39,12 +39,7 @@ class TurningPoint:
 
 
 def turning_methods(scene: Scene) -> tuple[str, ...]:
-    """Bases of the scene. Raises ReductionError: it has finite strain. BasisError: a basis that does not turn."""
-    if scene.effects.finite_strain is not None:
-        raise ReductionError(
-            f"scene {scene.name} has effects.finite_strain, and a reduced model in the frame of the hand is linear; "
-            "use --set effects.finite_strain=false for its linear law"
-        )
+    """Bases of the scene. Raises BasisError: a basis that does not turn."""
     names = tuple(scene.reduction.methods) or TURNING_METHODS
     if wrong := [name for name in names if name not in TURNING_METHODS]:
         raise BasisError(f"basis '{wrong[0]}' does not turn with effects.frame; name {' or '.join(TURNING_METHODS)}")

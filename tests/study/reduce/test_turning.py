@@ -13,7 +13,6 @@ from rich.console import Console
 import softgrasp as sg
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.file import shipped_scenes
-from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.bases.states import BasisError
 from softgrasp.reduction.turning.model import TurningModel
 from softgrasp.study.reduce.run import run_reduce
@@ -51,7 +50,6 @@ def test_numbers_are_those_of_the_saved_models(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "error", "text"),
     [
-        ("effects.finite_strain={}", ReductionError, r"--set effects\.finite_strain=false"),
         ("reduction.methods=['psd_fixed']", BasisError, "does not turn with effects.frame; name craig_bampton"),
         ("reduction.train='greedy'", SceneError, "a certified model cannot go with effects.frame"),
     ],
