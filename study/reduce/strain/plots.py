@@ -32,7 +32,7 @@ def figure_strain_errors(study: StrainStudy, out_png: Path) -> tuple[Path, ...]:
     """Errors against N, and against the number of cells."""
     colours = dict(zip((f.key for f in study.families), (style.BLUE, style.ORANGE), strict=False))
     with style.paper_style():
-        figure, (left, right) = plt.subplots(2, 1, figsize=(style.COLUMN + 0.9, 6.4), layout="constrained")
+        figure, (left, right) = plt.subplots(2, 1, figsize=(style.COLUMN + 0.9, 7.0), layout="constrained")
         for f in study.families:
             _pair(left, [p.N for p in f.points], f.points, colours[f.key], f.title)
             left.plot([p.N for p in f.points], [p.error_galerkin for p in f.points], ls=":", color=colours[f.key])
@@ -46,7 +46,7 @@ def figure_strain_errors(study: StrainStudy, out_png: Path) -> tuple[Path, ...]:
             ax.set_xlabel(label)
             style.log_axis(ax, None)
             ax.set_ylabel("error of the deformation z [1]")
-            ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+            ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(0.0, 1.0))
         at = {"xy": (0.99, study.linear), "xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
         right.annotate("linear elasticity", **at, fontsize=6.5)
         return tuple(style.save(figure, out_png))
