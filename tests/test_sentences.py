@@ -226,6 +226,8 @@ def test_models_without_motion_or_scenes_are_named(tmp_path: Path, monkeypatch: 
 
 
 def test_a_family_without_models_repeats_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    still: Any = SimpleNamespace(system=SimpleNamespace(frame=None))
+
     def refused(*_: Any) -> Any:
         raise ReductionError("too few snapshots")
 
@@ -234,11 +236,11 @@ def test_a_family_without_models_repeats_why(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(strain, "train", refused)
     with pytest.raises(SoftgraspError, match=r"no N of \[14\] fits: too few snapshots"):
-        strain._family("own", None, [], [], [14], lambda *_: None)  # type: ignore[arg-type]
+        strain._family("own", still, [], [], [14], lambda *_: None)
     training = SimpleNamespace(Phi=None, family=fails)
     monkeypatch.setattr(strain, "train", lambda *_: training)
     with pytest.raises(SoftgraspError, match=r"no N of \[14\] gives a model: no step"):
-        strain._family("own", None, [], [], [14], lambda *_: None)  # type: ignore[arg-type]
+        strain._family("own", still, [], [], [14], lambda *_: None)
     monkeypatch.setattr(turning, "possible_sizes", lambda *_: [])
     full: Any = SimpleNamespace(
         model=sg.build("turn_over", ["tissue.cells=[2, 4]"]), trajectory=SimpleNamespace(force=[])

@@ -168,22 +168,34 @@ class TurningStrainSystem(ReducedStrainSystem):
         return np.concatenate([turned[:d], np.zeros(n_s - d)])
 
     def run(
-        self, hand: tuple[Array, Array], *, a0: Array | None = None, tol: float = TOLERANCE, engine: str = ""
+        self,
+        hand: tuple[Array, Array] | None = None,
+        *,
+        force: Array | None = None,
+        a0: Array | None = None,
+        tol: float = TOLERANCE,
+        engine: str = "",
     ) -> TurningStrainRun:
         """Run under a hand that is led; online, not collective.
 
         Args:
             hand: q_s = [p; theta] and v_s = [p'; omega] in space, (steps + 1, n_s) each.
+            force: refused: a hand that a force moves needs the linear law.
             a0: start at rest, (k,); None is the undeformed body.
             tol: residual of a step over the largest load seen.
             engine: see :func:`softgrasp.reduction.strain.stepper.march_strain`.
 
         Raises:
-            ModelError: shapes do not fit, or the hand or the run leaves the training box.
+            ModelError: the hand is not led, shapes do not fit, or the hand or the run leaves the training box.
             SceneError: the hand turns by more than 0.5 rad in a step.
             SolverError: a step did not converge.
         """
         model, problem, d = self.model, self.problem, len(self.model.E)
+        if hand is None or force is not None:
+            raise ModelError(
+                "a model at finite strain in the frame of the hand runs under a hand that is led; give hand=(q_s, v_s) "
+                "and no force, or reduce the scene with effects.finite_strain = false for a free hand"
+            )
         q, v = checked_hand(hand, model.G.shape[1])
         if not (np.isfinite(q).all() and np.isfinite(v).all()):
             raise ModelError("the hand's tables contain numbers that are not finite")

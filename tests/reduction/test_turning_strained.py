@@ -31,10 +31,12 @@ def test_turn_is_that_of_the_full_run(comm: MPI.Intracomm, mpi_tmp_path: Path) -
     full = sg.simulate(other)
     again = sg.replay(rom, other, full)
     error = sg.errors(rom, again, other, full).z
-    assert error < 1e-2  # measured 4e-3; the linear law is off by 1.4e-2
+    assert error < 1e-2  # measured 4e-3; the linear law has 1.4e-2
     assert error / 4 < again.error_estimate < 4 * error  # an estimate, within three elsewhere
     with pytest.raises(ModelError, match=r"the hand turns at 11\.\d+ rad/s, above the"):
         rom.at(0.5 * own.times[1]).run((own.q_s, 2 * own.v_s))
+    with pytest.raises(ModelError, match="runs under a hand that is led"):
+        rom.at(own.times[1]).run(force=own.force)
     path = mpi_tmp_path / "rom.h5"
     sg.save(rom, path)
     loaded = sg.load(path, model.system.layout)
