@@ -99,7 +99,7 @@ def sagging(force: float) -> Act:
     """Newton's method on a body whose force at any place is the same."""
     potential = SimpleNamespace(force=lambda _: np.array([force]), tangent=lambda _: np.eye(1))
     own: Any = SimpleNamespace(
-        problem=SimpleNamespace(potential=potential), model=SimpleNamespace(G=np.eye(1)), gravity=np.ones(1)
+        problem=SimpleNamespace(potential=potential), model=SimpleNamespace(G=np.eye(1)), fall=lambda _: np.ones(1)
     )
     return lambda *_: ReducedStrainSystem.equilibrium(own)
 
@@ -112,7 +112,7 @@ def no_room(*_: Any) -> None:
     potential = SimpleNamespace(packed=[E, E], cells=cells, d=2, rounding=0.0)
     problem: Any = SimpleNamespace(potential=potential, S=E, dt=0.1)
     try:
-        stepper._march_c((ffi, lib), problem, E, 0.1, E, E, E)
+        stepper._march_c((ffi, lib), problem, E, E, 0.1, E, E, E, E)
     except MemoryError as error:
         raise SoftgraspError(str(error)) from error
 
