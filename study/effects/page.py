@@ -16,7 +16,7 @@ from softgrasp.fem import Scene, size_text
 from softgrasp.study.effects.result import EffectResult, EffectsStudy
 from softgrasp.study.forward.explain_page import error_lines
 from softgrasp.study.pictures import BLUE, GREEN, HAND, ORANGE, OUTLINE, WIDTH, paper_style, save
-from softgrasp.study.report import Columns, Page, Section, Table, in_words, percent, table_of
+from softgrasp.study.report import Columns, Page, Section, Table, in_words, percent, seconds_text, table_of
 from softgrasp.study.shell import Session
 
 CAPTION = (
@@ -60,7 +60,7 @@ COSTS: Columns = {
     "effect adds": "name",
     "assembly": lambda f: _seconds(f.cost.assembly, f.cost.assembly_range, f.cost.assembly_noise),
     "factor": lambda f: _seconds(f.cost.setup, f.cost.setup_range, f.cost.setup_noise),
-    "a step": lambda f: _more(f.cost.step, _time, f.cost.step_relative) if f.cost.step_shows else "noise",
+    "a step": lambda f: _more(f.cost.step, seconds_text, f.cost.step_relative) if f.cost.step_shows else "noise",
     "its operations": lambda f: percent(f.cost.flops_relative, "+") if f.cost.flops else "none",
     "memory": lambda f: _more(f.cost.memory, size_text, f.cost.memory_relative),
     "PETSc objects": lambda f: ", ".join(f"{n:+d} {kind.lower()}" for kind, n in f.cost.objects.items()) or "none",
@@ -96,7 +96,7 @@ def parts(study: EffectsStudy) -> list[Section]:
     ]
     advice.append(("all together", joint_changes(study)))
     base = study.base
-    times = [_time(base[stage]) for stage in ("assembly", "setup", "step")]
+    times = [seconds_text(base[stage]) for stage in ("assembly", "setup", "step")]
     scene = ("the scene", *times, _count(base["flops"]), size_text(base["memory"]), "")
     proofs = [
         (f.name, *("same" if same else "NOT the same" for same in astuple(f.proof))) for f in study.off if f.proof
@@ -157,16 +157,11 @@ def _more(value: float, text: Callable[[float], str], share: float) -> str:
 
 def _seconds(median: float, spread: tuple[float, float], noise: float) -> str:
     """Added time; noise when the paired samples do not agree in sign, or the scene differs from itself by as much."""
-    return "noise" if spread[0] <= 0 <= spread[1] or abs(median) <= noise else _signed(median, _time)
+    return "noise" if spread[0] <= 0 <= spread[1] or abs(median) <= noise else _signed(median, seconds_text)
 
 
 def _signed(value: float, text: Callable[[float], str]) -> str:
     return f"{'-' if value < 0 else '+'}{text(abs(value))}"
-
-
-def _time(seconds: float) -> str:
-    unit, factor = ("ms", 1e3) if seconds > 0.9995e-3 else ("us", 1e6)
-    return f"{factor * seconds:.{3 if factor * seconds < 999.5 else 4}g} {unit}"
 
 
 def _count(operations: float) -> str:

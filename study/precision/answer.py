@@ -14,7 +14,7 @@ from softgrasp.study.precision.predict import SAFETY, Prediction, Predictor
 from softgrasp.study.precision.reduced import ReducedRuns
 from softgrasp.study.precision.result import Answer, Choice, ReferenceSolution
 from softgrasp.study.precision.settings import Setting
-from softgrasp.study.report import percent
+from softgrasp.study.report import percent, seconds_text
 
 TRIES = 4  # settings that are run to check a prediction
 LUCK = 1.5  # times the tolerance: where more is predicted, errors of mesh and steps only cancel each other
@@ -38,16 +38,6 @@ def parse_budget(text: str) -> float:
     if not 0 < value < float("inf"):
         raise SceneError(f"--budget {text}: it must be a time > 0 with its unit, such as 1ms, 500us or 0.01s")
     return value
-
-
-def seconds_text(value: float | None) -> str:
-    """A time with a fitting unit."""
-    if value is None:
-        return "-"
-    for unit, factor in (("s", 1.0), ("ms", 1e-3)):
-        if value >= 0.9995 * factor:
-            return f"{value / factor:.3g} {unit}"
-    return f"{value / 1e-6:.3g} us"
 
 
 def advice(shares: dict[str, float]) -> str:

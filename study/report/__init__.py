@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         entry,
         in_words,
         percent,
+        seconds_text,
         show_sections,
         table_of,
     )

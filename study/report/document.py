@@ -142,6 +142,16 @@ def cell_text(cell: Any) -> str:
     return digits(float(cell)) if isinstance(cell, float | np.floating) else str(cell)
 
 
+def seconds_text(value: float | None) -> str:
+    """A time with a fitting unit."""
+    if value is None:
+        return "-"
+    for unit, factor in (("s", 1.0), ("ms", 1e-3)):
+        if value >= 0.9995 * factor:
+            return f"{value / factor:.3g} {unit}"
+    return f"{value / 1e-6:.3g} us"
+
+
 def number(value: float | None) -> str:
     """Three digits, or all before the point; a dash for None."""
     if value is None:
