@@ -46,7 +46,7 @@ class Plan:
     c: Array  # deviations from the gain of the grid, (n_s H,)
     normals: Array  # of the half-plane of every obstacle and interval, (obstacles, H, d)
     slack: Array  # depth inside clearance and margin, by obstacle and interval [m], (obstacles, H)
-    bend: float  # largest bound on what a node that holds the plan does between two instants, and off small angles [m]
+    bend: float  # largest margin of a node with an active gap, between two instants and for the square of the angle [m]
     multiplier: float  # largest dJ of a metre of one gap at one instant, twice its multiplier in |c|^2 / 2 [1/m]
     active: tuple[int, ...]  # rows that hold the plan, empty where gaps are not kept
     costs: tuple[float, ...]  # |c|^2 of the rounds
@@ -264,7 +264,7 @@ def _rows(horizon: Horizon, task: Task, normals: Array, c: Array) -> tuple[Array
     """Rows of all obstacles with room for the bends of the plan c, and the group of each: its obstacle and interval."""
     rows, right = [np.zeros((0, len(c)))], [np.zeros(0)]
     x, u = horizon.state(task.start, c), horizon.input(task.start, c)
-    off = _off_angle(horizon.plant, task, x, u)
+    off = _by_angle(horizon.plant, task, x, u)
     rounding = ROUNDING * task.size  # so that no gap of the plan is below zero by it
     for i, (shape, n) in enumerate(zip(task.shapes, normals, strict=True)):
         margin = ROOM * (both_ends(bends(horizon.plant, x, u, n, path_turns(horizon, task, i, n))) + off)
@@ -278,8 +278,8 @@ def _rows(horizon: Horizon, task: Task, normals: Array, c: Array) -> tuple[Array
     return np.vstack(rows), h, group
 
 
-def _off_angle(plant: HeldPlant, task: Task, x: Array, u: Array) -> Array | float:
-    """How far nodes may be from where small angles have them, (H, parts + 1, nodes) [m]."""
+def _by_angle(plant: HeldPlant, task: Task, x: Array, u: Array) -> Array | float:
+    """Bound on the distance of nodes from their places by small angles, (H, parts + 1, nodes) [m]."""
     return 0.0 if task.angle is None else turned(plant, x, u, np.asarray(task.arms), task.angle)
 
 
@@ -314,7 +314,7 @@ def _judged(
     if len(u) - H == MOST_FOLLOWED:
         unsafe[-1] = True
     gap, bend = np.inf, 0.0
-    target, off = at_target(task, H * plant.grid), _off_angle(plant, task, x, u)
+    target, off = at_target(task, H * plant.grid), _by_angle(plant, task, x, u)
     for i, (shape, ahead, (normal, _)) in enumerate(zip(task.shapes, normals, target, strict=True)):
         n = np.concatenate([ahead, np.tile(normal, (len(u) - H, 1))])
         turns = path_turns(horizon, task, i, n)

@@ -181,7 +181,7 @@ def speeds(plant: HeldPlant) -> slice:
 
 
 def turned(plant: HeldPlant, states: Array, inputs: Array, arms: Array, angle: Array) -> Array:
-    """Bound on how far nodes are from where small angles have them, (H, parts + 1, nodes) [m]: |r_j| theta^2 / 2.
+    """|r_j| theta^2 / 2, a bound on the distance of nodes from their places by small angles, (H, parts + 1, nodes) [m].
 
     Args:
         states: at all instants, (H, parts + 1, N); ``inputs``: (H, n_s).
