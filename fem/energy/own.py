@@ -23,6 +23,7 @@ class OwnEnergy:
 
     W: Callable[[Any, Any], Any]  # energy per volume of the rest state [J/m^3] in UFL
     name: str  # "file.py:W", or the name of the callable
+    # laws made so far, by names of parameters and dimension
     laws: dict[tuple[Any, ...], EnergyLaw] = field(default_factory=dict, repr=False, compare=False)
 
     def law(self, scene: Scene, d: int) -> EnergyLaw:

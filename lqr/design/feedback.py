@@ -25,8 +25,8 @@ from softgrasp.lqr.spectrum.modal_loop import LoopQuality
 from softgrasp.lqr.spectrum.sampled import Sampling
 
 Progress = Callable[[dict[str, float]], None]
-MODAL_MODES = 10
-MODAL_CANDIDATES = 40
+MODAL_MODES = 10  # that method = "modal" controls at most
+MODAL_CANDIDATES = 40  # lowest modes of which it chooses them
 ROUNDING = 1e-8  # of an eigenvalue on the unit circle
 
 

@@ -91,7 +91,7 @@ def not_yet(answer: Identified) -> bool:
     """Whether an answer lacks what no other law gives: a finer mesh or step, or more data."""
     parts = [answer.parts[name] for name in ("mesh", "time step", "reduction")]
     fine = all(part is not None and (np.abs(part) <= answer.noise).all() for part in parts)
-    return not fine or bool(unseen(answer.unknowns, answer.sight, answer.directions))
+    return not fine or bool(unseen(answer.unknowns, answer.sensitivities, answer.directions))
 
 
 def with_part(answer: Identified, part: Array) -> Identified:

@@ -315,7 +315,7 @@ def _answer(solved: Solved, start: Array, asked: Asked) -> Identified:
         sampled = on_root(comm, lambda: sample(misfit, found.p, line.whole, asked.posterior, robust))
     return Identified(
         unknowns=unknowns, start=start, values=values, noise=noise, parts=parts, kinds=kinds, law=solved.law,
-        covariance=line.covariance, sight=line.sizes, directions=line.directions,
+        covariance=line.covariance, sensitivities=line.sizes, directions=line.directions,
         assumed={u.name: -line.inverse @ misfit.slopes(found.p, [u])[:, 0] for u in misfit.near.rests_on()},
         nuisances=_nuisances(solved, data, columns),
         residuals=judged,
@@ -347,7 +347,8 @@ def _cures(
 def refinement(answer: Identified) -> Scene | None:
     """The scene that a refused answer needs, at the values it started from; None where both are fine enough."""
     mesh, step, estimate, noise = answer.parts["mesh"], answer.parts["time step"], answer.estimate, answer.noise
-    if unseen(answer.unknowns, answer.sight, answer.directions) or mesh is None or step is None or estimate is None:
+    undetermined = unseen(answer.unknowns, answer.sensitivities, answer.directions)
+    if undetermined or mesh is None or step is None or estimate is None:
         return None
     scene = scene_at(answer.scene, answer.unknowns, answer.start)
     tolerance = finer_tolerance(mesh, noise, estimate) if (np.abs(mesh) > noise).any() else None

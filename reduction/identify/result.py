@@ -56,10 +56,10 @@ class Identified(Shown):
     """Law of the material, "linear" or the name of a hyperelastic one."""
     covariance: Array
     """Covariance of log(values) by the noise, (k, k) [1]."""
-    sight: Array
+    sensitivities: Array
     """Change of the data by a unit of each direction of log(values), (k,) [sigma]."""
     directions: Array
-    """Directions of log(values), one a row, the best seen first, (k, k) [1]."""
+    """Directions of log(values), one a row, the largest sensitivity first, (k, k) [1]."""
     assumed: dict[str, Array]
     """Change of log(values) by a unit of the logarithm of each parameter that was not fitted, by its name, (k,) [1]."""
     nuisances: tuple[Nuisance, ...]

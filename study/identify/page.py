@@ -43,7 +43,7 @@ def compose(answer: Identified, session: Session, fitted: Path, options: str) ->
             "of log(value / truth).",
             terminal=True, figures=figures[1:2],
         ),
-        sight_table(answer).section("A combination with a deviation above 100 % is not determined by the data."),
+        determined_table(answer).section("A combination with a deviation above 100 % is not determined by the data."),
         *([assumed_table(answer).section(ASSUMED, terminal=True)] if answer.assumed else []),
         *([nuisance_table(answer).section(terminal=True)] if answer.nuisances else []),
         *([posterior_table(answer).section(posterior_sentence(answer), terminal=True)] if answer.posterior else []),
@@ -96,11 +96,11 @@ def posterior_sentence(answer: Identified) -> str:
     )
 
 
-def sight_table(answer: Identified) -> Table:
+def determined_table(answer: Identified) -> Table:
     """What the data determine, the best first."""
     rows = [
         (direction_in_words(answer.unknowns, d, SHOWN_POWER), Share(1 / max(float(s), 1e-12)))
-        for s, d in zip(answer.sight, answer.directions, strict=True)
+        for s, d in zip(answer.sensitivities, answer.directions, strict=True)
     ]
     return Table(("the data determine", "with a deviation of"), rows, "What the data determine")
 
@@ -199,7 +199,7 @@ def result_of(answer: Identified) -> dict[str, Any]:
         "correlation": answer.correlation,
         "directions": [
             {"deviation": 1 / max(float(s), 1e-300), "of": dict(zip([u.name for u in answer.unknowns], d, strict=True))}
-            for s, d in zip(answer.sight, answer.directions, strict=True)
+            for s, d in zip(answer.sensitivities, answer.directions, strict=True)
         ],
         "assumed": answer.assumed,
         "beside": [
