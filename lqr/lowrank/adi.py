@@ -10,7 +10,14 @@ import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, Complex, on_root
-from softgrasp.lqr.lowrank.adjoint import AdjointRhs, AdjointSolution, closed_adjoint, mass_rhs
+from softgrasp.lqr.lowrank.adjoint import (
+    AdjointRhs,
+    AdjointSolution,
+    OpenSolution,
+    closed_adjoint,
+    mass_rhs,
+    open_adjoints,
+)
 from softgrasp.lqr.lowrank.compress import compress, gram
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
@@ -90,6 +97,7 @@ class LowRankSweep:
     state: AdjointRhs  # [K', W, ...] with the gain K' and the residual factor W
     Z: FactorColumns  # factor of X ~ Z Z'
     steps: int = 0  # number of solves so far
+    waiting: list[OpenSolution] = field(default_factory=list)  # of the next shifts, solved with beside the last one
     # time by stage [s]
     seconds: dict[str, float] = field(default_factory=lambda: {"shifts": 0.0, "small": 0.0, "products": 0.0})
 
@@ -111,7 +119,16 @@ class LowRankSweep:
         p, ahead = queue.next()
         self.seconds["shifts"] += time.perf_counter() - begin
         self.steps += 1
-        return p, closed_adjoint(plant, tissue, p, self.state[: m + self.W.columns], ahead)
+        right = self.state[: m + self.W.columns]
+        if not self.waiting:
+            self.waiting = open_adjoints(plant, tissue, [p, *ahead], right)
+        return p, closed_adjoint(plant, self.waiting.pop(0), right)
+
+    def advance(self, V: AdjointSolution, coefficients: Complex, Z: Block, small: Array) -> None:
+        """W <- W + E'Z small for Z = Re(V c), and K' and dK' likewise. Collective."""
+        self.state = self.state.plus(mass_rhs(self.Z.plant, Z), small)
+        for i, solution in enumerate(self.waiting):
+            self.waiting[i] = solution.moved(V, coefficients, small[:, : solution.b.shape[1]])
 
 
 @dataclass
@@ -159,7 +176,7 @@ def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: AdiSweep, queue: ShiftQ
     small = np.zeros((Z.columns, q + 2 * m))
     np.fill_diagonal(small[:q, m : m + q], g)
     small[:, m + q :] = plant.inputs_of(Z)
-    sweep.state = sweep.state.plus(mass_rhs(plant, Z), small)
+    sweep.advance(V, coefficients, Z, small)
     sweep.Z.append(Z)
     sweep.seconds["products"] += time.perf_counter() - begin
     return p

@@ -14,6 +14,10 @@ from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.plant.block import Block
 
+# Shifts nearer to each other, in parts of the larger one, are solved with in turn: of two that are solved with side by
+# side the second solution loses the digits of their relative distance.
+APART = 0.05
+
 
 class AdjointRhs(Block):
     """Right-hand side W; ``tall`` has the rows z, v_z and those of a = K_ee^{-1} W_z, (3 n_local, k)."""
@@ -34,25 +38,51 @@ class AdjointRhs(Block):
 
 
 @dataclass(frozen=True)
+class OpenSolution:
+    """X = (A + p E)^{-T} R of the open loop, without its displacement part a = (K^{-1} R_z + b) / p."""
+
+    p: complex  # shift [1/s]
+    hand: Complex  # a_s and b_s, (2 n_s, k)
+    b: Complex  # velocity part b, local rows (n_local, k), C-contiguous
+
+    def moved(self, V: AdjointSolution, coefficients: Complex, small: Array) -> OpenSolution:
+        """(A + p E)^{-T} (R + E' Re(V c) s) for the V of another shift q and the same R, without a solve.
+
+        V = Y mix with Y = (A + q E)^{-T} R, and the resolvent identity gives (A + p E)^{-T} E'Y = (Y - X) / (p - q).
+
+        Args:
+            coefficients: c.
+            small: s, (columns of c, k).
+        """
+        Y, u = V.open, V.mix @ coefficients / 2
+        direct = u @ small / (self.p - Y.p)
+        conjugate = u.conj() @ small / (self.p - Y.p.conjugate())
+        rest = np.eye(len(direct)) - direct - conjugate
+
+        def combined(X: Complex, other: Complex) -> Complex:
+            return np.asarray(X @ rest + other @ direct + other.conj() @ conjugate)
+
+        return OpenSolution(self.p, combined(self.hand, Y.hand), combined(self.b, Y.b))
+
+
+@dataclass(frozen=True)
 class AdjointSolution:
     """V = [a_s; b_s; a; b] = (solutions of the open loop for K' and W) mix, a = (a_0 + b) / p."""
 
-    p: complex  # shift [1/s]
-    hand: Complex  # a_s and b_s of the open loop, (2 n_s, k)
-    b: Complex  # velocity part b of the open loop, local rows (n_local, k), C-contiguous
+    open: OpenSolution  # of the open loop, for K' and W, k columns
     a: Array  # a_0 = K_ee^{-1} W_z, local rows (n_local, k)
     mix: Complex  # coefficients of the Sherman-Morrison-Woodbury formula, (k, q)
 
     def real(self, coefficients: Complex) -> Block:
         """Re(V c) for a (q, l) matrix c, without V: one real product each for a and b."""
-        n, weight_b = len(self.b), self.mix @ coefficients
-        weight_a = weight_b / self.p
-        pairs = _pairs(self.b)
+        n, weight_b = len(self.a), self.mix @ coefficients
+        weight_a = weight_b / self.open.p
+        pairs = _pairs(self.open.b)
         tall = np.empty((2 * n, weight_b.shape[1]))
         np.matmul(self.a, weight_a.real, out=tall[:n])
         tall[:n] += pairs @ _paired(weight_a)
         np.matmul(pairs, _paired(weight_b), out=tall[n:])
-        return Block(np.asarray((self.hand @ weight_b).real), tall)
+        return Block(np.asarray((self.open.hand @ weight_b).real), tall)
 
 
 def _pairs(b: Complex) -> Array:
@@ -98,10 +128,8 @@ def mass_rhs(plant: Plant, V: Block) -> AdjointRhs:
     return AdjointRhs(E_V.hand, rows)
 
 
-def open_adjoint(
-    plant: Plant, tissue: ShiftedTissue, p: complex, W: AdjointRhs, ahead: Sequence[complex] = ()
-) -> tuple[Complex, Complex]:
-    """Solve (A + p E)'V = W; returns a_s and b_s (2 n_s, k), and b (n_local, k).
+def open_adjoints(plant: Plant, tissue: ShiftedTissue, shifts: Sequence[complex], W: AdjointRhs) -> list[OpenSolution]:
+    """Solve (A + p E)'V = W for the first shift p, and for those after it that ranks solve with at the same time.
 
     Elimination of a_s = W_q / p and the displacement part a = (K^{-1} W_z + b) / p leaves
 
@@ -111,13 +139,28 @@ def open_adjoint(
     H = G for two-way coupling, else 0: back substitution one-way, the Schur complement of order n_s two-way.
     Collective.
     """
-    n, s, q = plant.n_local, plant.n_s, W.columns
-    p = complex(p)
-    factor, hand = p - plant.drag_es, W.hand
-    F = np.asarray(p * W.tall[n : 2 * n] - W.tall[:n], dtype=complex)
+    n = plant.n_local
+    shifts = [complex(p) for p in shifts]
+    count = min(tissue.group(shifts), _apart(shifts))
+    rights = [np.asarray(p * W.tall[n : 2 * n] - W.tall[:n], dtype=complex) for p in shifts[:count]]
     if plant.two_way:
-        F = np.hstack([F, plant.G])
-    b = np.ascontiguousarray(tissue.solve(p, F, ahead))
+        rights = [np.hstack([F, plant.G]) for F in rights]
+    answers = tissue.solve_each(shifts[:count], rights, shifts[count:])
+    return [_with_hand(plant, p, W, np.ascontiguousarray(b)) for p, b in zip(shifts, answers, strict=False)]
+
+
+def _apart(shifts: list[complex]) -> int:
+    """How many of the first shifts lie so far apart that :meth:`OpenSolution.moved` keeps its digits."""
+    for i, q in enumerate(shifts):
+        if any(abs(q - p) < APART * max(abs(p), abs(q)) for p in shifts[:i]):
+            return i
+    return len(shifts)
+
+
+def _with_hand(plant: Plant, p: complex, W: AdjointRhs, b: Complex) -> OpenSolution:
+    """The solution of the open loop from b of the tissue alone and, two-way, the responses to G. Collective."""
+    s, q = plant.n_s, W.columns
+    factor, hand = p - plant.drag_es, W.hand
     small = p * plant.M_s - plant.drag_hand * plant.system.M_rigid
     G_b = _total(plant, plant.G, b)
     right = hand[s:] - hand[:s] / p - factor * G_b[:, :q]
@@ -127,21 +170,19 @@ def open_adjoint(
         b = np.ascontiguousarray(b[:, :q] - b[:, q:] @ (weight * b_s))
     else:
         b_s = _solve_small(np.asarray(small), right)
-    return np.vstack([hand[:s] / p, b_s]), b
+    return OpenSolution(p, np.vstack([hand[:s] / p, b_s]), b)
 
 
-def closed_adjoint(
-    plant: Plant, tissue: ShiftedTissue, p: complex, right: AdjointRhs, ahead: Sequence[complex] = ()
-) -> AdjointSolution:
+def closed_adjoint(plant: Plant, solution: OpenSolution, right: AdjointRhs) -> AdjointSolution:
     """Solve (A - B K + p E)'V = W by the Sherman-Morrison-Woodbury formula.
 
     [N, L] = (A + pE)^{-T} [K', W],  V = L + N (I - B'N)^{-1} B'L. Collective.
 
-    ``right``: [K', W]; ``ahead``: shifts that will probably come next.
+    ``solution``: [N, L]; ``right``: [K', W].
     """
-    hand, b = open_adjoint(plant, tissue, p, right, ahead)
+    hand, b = solution.hand, solution.b
     B_V = plant.B.T @ hand[plant.n_s :] if plant.B_z is None else _total(plant, plant.B_z, b)
     m = plant.inputs
     small = _solve_small(np.eye(m, dtype=complex) - B_V[:, :m], B_V[:, m:])
     mix = np.vstack([small, np.eye(right.columns - m)])
-    return AdjointSolution(complex(p), hand, b, right.tall[2 * plant.n_local :], mix)
+    return AdjointSolution(solution, right.tall[2 * plant.n_local :], mix)

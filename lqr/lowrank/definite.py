@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -60,10 +61,11 @@ class DefiniteTissue(ShiftedTissue):
         self.shift = p
         self.factors += 1
 
-    def _solve(self, p: complex, F: Array | Complex) -> Complex:
+    def _solve_each(self, shifts: Sequence[complex], rights: Sequence[Array | Complex]) -> list[Complex]:
+        (F,) = rights
         right = np.asfortranarray(F.real)
         answer = static_columns(self.system, right) if self.solver is None else self.solver.columns(right)
-        return answer.astype(complex)
+        return [answer.astype(complex)]
 
     def destroy(self) -> None:
         """Free the solver. Collective."""

@@ -206,10 +206,13 @@ class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
                 if i == 0
                 else [complex(-w) if real else _response_shift(plant, w) for w in grid[used - 1 :][: self.per_step]]
             )
-            for j, p in enumerate(take):
-                response = tissue.solve(p, loads, take[j + 1 :])
-                parts = [response.real] if p.imag == 0 else [response.real, response.imag]
-                space = space.grown(plant, np.hstack(parts))
+            rest = take[:]
+            while rest:
+                now = rest[: tissue.group(rest)]
+                rest = rest[len(now) :]
+                for p, response in zip(now, tissue.solve_each(now, [loads] * len(now), rest), strict=True):
+                    parts = [response.real] if p.imag == 0 else [response.real, response.imag]
+                    space = space.grown(plant, np.hstack(parts))
             used += len(take)
             if space.V.shape[1] < min(len(level.omega) + len(take), whole):  # nothing new: no evidence either
                 continue

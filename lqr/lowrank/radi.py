@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, on_root
+from softgrasp.fem.petsc import Array, Complex, on_root
 from softgrasp.lqr.lowrank.adi import GROWTH, SHARE, FactorColumns, LowRankSweep
-from softgrasp.lqr.lowrank.adjoint import AdjointRhs, AdjointSolution, adjoint_rhs, mass_rhs
+from softgrasp.lqr.lowrank.adjoint import AdjointRhs, AdjointSolution, adjoint_rhs
 from softgrasp.lqr.lowrank.compress import gram
 from softgrasp.lqr.lowrank.modal_start import ModalStart, modal_start
 from softgrasp.lqr.lowrank.plant import Plant
@@ -22,8 +22,8 @@ from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import MODAL_KEY
 
 
-def radi_columns(plant: Plant, s: complex, V: AdjointSolution) -> tuple[Block, Array, Array, float]:
-    """V_1, Y, V_1'B and c of X += V_1 Y^{-1} V_1', W += c E'V_1 (first q columns of Y^{-1}) [BBKS18].
+def radi_columns(plant: Plant, s: complex, V: AdjointSolution) -> tuple[Complex, Block, Array, Array, float]:
+    """Weights of V_1, V_1, Y, V_1'B and c of X += V_1 Y^{-1} V_1', W += c E'V_1 (first q columns of Y^{-1}) [BBKS18].
 
     s real: V_1 = sqrt(-2s) V, Y = I - V_1'B B'V_1 / (2s). s complex: V_1 = sqrt(-2 Re s) [Re V, Im V] and the Y of the
     pair. Collective.
@@ -32,17 +32,19 @@ def radi_columns(plant: Plant, s: complex, V: AdjointSolution) -> tuple[Block, A
     one = np.eye(q)
     c = float(np.sqrt(-2 * s.real))
     if s.imag == 0:
-        columns = V.real(np.asarray(c * one, dtype=complex))
+        coefficients = np.asarray(c * one, dtype=complex)
+        columns = V.real(coefficients)
         V_B = plant.inputs_of(columns)
-        return columns, one - V_B @ V_B.T / (2 * s.real), V_B, c
-    columns = V.real(np.asarray(c * np.hstack([one, -1j * one]), dtype=complex))
+        return coefficients, columns, one - V_B @ V_B.T / (2 * s.real), V_B, c
+    coefficients = np.asarray(c * np.hstack([one, -1j * one]), dtype=complex)
+    columns = V.real(coefficients)
     V_B = plant.inputs_of(columns)
     real, imag = V_B[:q], V_B[q:]
     a, b = s.real / abs(s), s.imag / abs(s)
     F_1 = np.vstack([-a * real - b * imag, b * real - a * imag])
     F_3 = np.vstack([b * one, a * one])
     Y = np.diag(np.repeat([1.0, 0.5], q)) - (F_1 @ F_1.T + V_B @ V_B.T) / (4 * s.real) - F_3 @ F_3.T / 2
-    return columns, Y, V_B, c
+    return coefficients, columns, Y, V_B, c
 
 
 def radi_step(plant: Plant, tissue: ShiftedTissue, sweep: LowRankSweep, queue: ShiftQueue) -> complex:
@@ -53,13 +55,13 @@ def radi_step(plant: Plant, tissue: ShiftedTissue, sweep: LowRankSweep, queue: S
     q = sweep.W.columns
     s, V = sweep.solve(tissue, queue)
     begin = time.perf_counter()
-    columns, Y, V_B, c = radi_columns(plant, s, V)
+    coefficients, columns, Y, V_B, c = radi_columns(plant, s, V)
     try:
         inverse = on_root(plant.comm, lambda: np.linalg.inv(np.linalg.cholesky((Y + Y.T) / 2)))
     except np.linalg.LinAlgError as error:
         raise SolverError(f"radi: the step at the shift {s:.4g} is not definite; use newton_adi") from error
     weight = inverse.T @ inverse
-    sweep.state = sweep.state.plus(mass_rhs(plant, columns), np.hstack([weight @ V_B, c * weight[:, :q]]))
+    sweep.advance(V, coefficients, columns, np.hstack([weight @ V_B, c * weight[:, :q]]))
     sweep.Z.append(columns.times(inverse.T))
     sweep.seconds["products"] += time.perf_counter() - begin
     return s

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from softgrasp.fem.petsc import Array, Complex, PETSc, from_options, petsc_optio
 from softgrasp.fem.resources import free_memory
 from softgrasp.fem.solve.cholesky import direct_solves
 from softgrasp.fem.system import BlockSystem
+from softgrasp.lqr.lowrank.ahead import FactorsAhead
 from softgrasp.lqr.plant.checks import MODAL_KEY
 
 PREFIX = "softgrasp_shifted_"
@@ -36,64 +36,6 @@ AHEAD_FROM = 5_000  # n_e from which other cores, if there are, make the next fa
 # memory in 3D.
 THREADS = {1: 2, 2: 2, 3: 1}
 _SYMMETRIC = {"SymmetricMode": True, "Equil": False}
-
-
-class FactorsAhead:
-    """A few threads of one factor each.
-
-    SciPy frees the memory of a factor in the thread that made it and in no other, so each factor goes back there.
-
-    Attributes:
-        make: factor of S(p) at a shift p; the second argument is the number of the thread, for what it may overwrite.
-        threads: executors of one thread each.
-        coming: factors under way, by shift: number of the thread, and the future.
-        maker: number of the thread that made the factor taken last.
-    """
-
-    def __init__(self, make: Callable[[complex, int], scipy.sparse.linalg.SuperLU], threads: int) -> None:
-        self.make = make
-        self.threads = [ThreadPoolExecutor(1) for _ in range(threads)]
-        self.coming: dict[complex, tuple[int, Future[scipy.sparse.linalg.SuperLU]]] = {}
-        self.maker = 0
-
-    def take(self, shifts: Sequence[complex]) -> scipy.sparse.linalg.SuperLU:
-        """The factor of the first shift; the others are begun as far as threads are idle.
-
-        The caller hands its older factor to :meth:`free` before.
-        """
-        known = len(self.threads) - (shifts[0] not in self.coming)  # one thread has to be left for the first
-        for p in [p for p in self.coming if p not in shifts[: 1 + known]]:
-            self._drop(p)
-        self._begin(shifts)
-        self.maker, future = self.coming.pop(shifts[0])
-        try:
-            factor = future.result()
-        finally:
-            del future  # in a traceback it would keep everything alive that the caller references
-        self._begin(shifts[1:])
-        return factor
-
-    def _drop(self, p: complex) -> None:
-        self.maker = self.coming[p][0]
-        self.free([self.coming.pop(p)])  # no name may refer to it when the thread lets it go
-
-    def _begin(self, shifts: Sequence[complex]) -> None:
-        for p in shifts[: 1 + len(self.threads)]:
-            idle = set(range(len(self.threads))) - {i for i, _ in self.coming.values()}
-            if p not in self.coming and idle:
-                i = min(idle)
-                self.coming[p] = (i, self.threads[i].submit(self.make, p, i))
-
-    def free(self, box: list[object]) -> None:
-        """Empty a list with the only reference to the last factor, in the thread that made it."""
-        self.threads[self.maker].submit(box.clear)
-
-    def close(self) -> None:
-        """Finish what is under way and free it."""
-        for p in list(self.coming):
-            self._drop(p)
-        for thread in self.threads:
-            thread.shutdown()
 
 
 class ShiftedTissue(ABC):
@@ -116,22 +58,34 @@ class ShiftedTissue(ABC):
 
         Raises SolverError: the factorisation or the solve fails.
         """
-        p = complex(p)
+        return self.solve_each([complex(p)], [F], ahead)[0]
+
+    def solve_each(
+        self, shifts: Sequence[complex], rights: Sequence[Array | Complex], ahead: Sequence[complex] = ()
+    ) -> list[Complex]:
+        """Local rows of S(p_i)^{-1} F_i of the first shifts, of :meth:`group` at most. Collective.
+
+        Raises SolverError: a factorisation or a solve fails.
+        """
         begin = time.perf_counter()
-        self._factor([p, *(complex(q) for q in ahead)])
+        self._factor([*shifts, *(complex(q) for q in ahead)])
         middle = time.perf_counter()
-        result = self._solve(p, F)
+        results = self._solve_each(shifts, rights)
         self.seconds["factor"] += middle - begin
         self.seconds["solve"] += time.perf_counter() - middle
-        return result
+        return results
+
+    def group(self, shifts: Sequence[complex]) -> int:
+        """How many of the first shifts are solved with at the same time."""
+        return 1
 
     @abstractmethod
     def _factor(self, shifts: list[complex]) -> None:
         """Have the factor of the first shift, made now or before. Collective."""
 
     @abstractmethod
-    def _solve(self, p: complex, F: Array | Complex) -> Complex:
-        """S(p)^{-1} F with that factor. Collective."""
+    def _solve_each(self, shifts: Sequence[complex], rights: Sequence[Array | Complex]) -> list[Complex]:
+        """S(p_i)^{-1} F_i with these factors. Collective."""
 
     @abstractmethod
     def destroy(self) -> None:
@@ -144,7 +98,7 @@ class ShiftedTissue(ABC):
 
 
 class GatheredTissue(ShiftedTissue):
-    """Every rank stores all rows; the factors of ``comm.size`` shifts are made at the same time, one a rank.
+    """Every rank stores all rows; factors of ``comm.size`` shifts are made, and solve, at the same time, one a rank.
 
     SuperLU in complex numbers with diagonal pivots and one fill-reducing order (nested dissection) for all shifts. A
     program of one rank that may use another core makes the next factors there while it works with the present one.
@@ -233,23 +187,33 @@ class GatheredTissue(ShiftedTissue):
             del factor
             self.ahead.free(box)
 
-    def _solve(self, p: complex, F: Array | Complex) -> Complex:
-        """On several ranks: rows to the owner of the factor, solve there, rows back. Collective."""
-        owner, lu = self.cache[p]
-        real = p.imag == 0
+    def group(self, shifts: Sequence[complex]) -> int:
+        """One a rank, of those that have factors if the first has one."""
+        first = list(dict.fromkeys(shifts[: self.comm.size]))
+        if first[0] in self.cache:
+            first = [p for p in first if p in self.cache]
+        return next((i for i, (p, q) in enumerate(zip(first, shifts, strict=False)) if p != q), len(first))
+
+    def _solve_each(self, shifts: Sequence[complex], rights: Sequence[Array | Complex]) -> list[Complex]:
+        """On several ranks: rows to the owners of the factors, solves there, rows back. Collective."""
         if self.comm.size == 1:
-            return _lu_solve(lu, F, self.order, real)
-        k = F.shape[1]
-        local = np.ascontiguousarray(F, dtype=complex)
-        owner_here = self.comm.rank == owner
-        whole = np.empty((int(self.counts.sum()), k), dtype=complex) if owner_here else None
-        sizes = self.counts * k
-        self.comm.Gatherv(local, None if whole is None else [whole, sizes], root=owner)
-        if whole is not None and lu is not None:
-            whole = np.ascontiguousarray(_lu_solve(lu, whole, self.order, real))
-        result = np.empty((self.n_local, k), dtype=complex)
-        self.comm.Scatterv(None if whole is None else [whole, sizes], result, root=owner)
-        return result
+            ((p,), (F,)) = shifts, rights
+            return [_lu_solve(self.cache[p][1], F, self.order, p.imag == 0)]
+        whole: dict[int, Complex] = {}
+        for i, (p, F) in enumerate(zip(shifts, rights, strict=True)):
+            k, owner = F.shape[1], self.cache[p][0]
+            if self.comm.rank == owner:
+                whole[i] = np.empty((int(self.counts.sum()), k), dtype=complex)
+            rows = [whole[i], self.counts * k] if i in whole else None
+            self.comm.Gatherv(np.ascontiguousarray(F, dtype=complex), rows, root=owner)
+        for i, F in whole.items():
+            p = shifts[i]
+            whole[i] = np.ascontiguousarray(_lu_solve(self.cache[p][1], F, self.order, p.imag == 0))
+        results = [np.empty(F.shape, dtype=complex) for F in rights]
+        for i, (p, result) in enumerate(zip(shifts, results, strict=True)):
+            rows = [whole[i], self.counts * result.shape[1]] if i in whole else None
+            self.comm.Scatterv(rows, result, root=self.cache[p][0])
+        return results
 
     def destroy(self) -> None:
         """Free the factors."""
@@ -263,8 +227,11 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _lu_solve(lu: scipy.sparse.linalg.SuperLU, F: Array | Complex, order: NDArray[np.int64], real: bool) -> Complex:
+def _lu_solve(
+    lu: scipy.sparse.linalg.SuperLU | None, F: Array | Complex, order: NDArray[np.int64], real: bool
+) -> Complex:
     """Solve with a factor of the permuted matrix; real factors solve real and imaginary part in turn."""
+    assert lu is not None  # of another rank
     right = F[order]
     result = np.empty(F.shape, dtype=complex)
     if not real:
@@ -335,7 +302,8 @@ class DistributedTissue(ShiftedTissue):
         self.shift = p
         self.factors += 1
 
-    def _solve(self, p: complex, F: Array | Complex) -> Complex:
+    def _solve_each(self, shifts: Sequence[complex], rights: Sequence[Array | Complex]) -> list[Complex]:
+        ((p,), (F,)) = shifts, rights
         n, k = self.n_local, F.shape[1]
         right = np.empty((2 * n, k), order="F")
         right[0::2], right[1::2] = F.real, -F.imag
@@ -349,7 +317,7 @@ class DistributedTissue(ShiftedTissue):
         finally:
             B.destroy()
             X.destroy()
-        return answer[0::2] + 1j * answer[1::2]
+        return [answer[0::2] + 1j * answer[1::2]]
 
     def destroy(self) -> None:
         """Free matrix and factor. Collective."""

@@ -67,7 +67,7 @@ def no_steps(*_: Any) -> None:
 
 def turned(_: Path, patch: pytest.MonkeyPatch) -> None:
     """A step whose small matrix rounding has made indefinite."""
-    patch.setattr(radi, "radi_columns", lambda plant, s, V: (V, -np.eye(2), np.zeros((2, 2)), 1.0))
+    patch.setattr(radi, "radi_columns", lambda plant, s, V: (V, V, -np.eye(2), np.zeros((2, 2)), 1.0))
     radi.RADI().solve(problem())
 
 

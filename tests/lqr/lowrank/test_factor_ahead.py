@@ -14,7 +14,8 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.lqr.lowrank import shifted
-from softgrasp.lqr.lowrank.shifted import FactorsAhead, GatheredTissue
+from softgrasp.lqr.lowrank.ahead import FactorsAhead
+from softgrasp.lqr.lowrank.shifted import GatheredTissue
 from tests.helpers.models import make_scene
 
 pytestmark = pytest.mark.serial

@@ -14,7 +14,7 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.dense.modal import relative_space
-from softgrasp.lqr.lowrank.adjoint import adjoint_rhs, closed_adjoint
+from softgrasp.lqr.lowrank.adjoint import adjoint_rhs, closed_adjoint, mass_rhs, open_adjoints
 from softgrasp.lqr.lowrank.compress import compress
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin, frequencies
 from softgrasp.lqr.lowrank.modal_start import modal_start, plant_modes
@@ -46,7 +46,7 @@ def test_shifted_adjoint_solve_is_the_dense_one(name: str, tissue: str) -> None:
     right = adjoint_rhs(plant, solver, local)
     K_full, W_full = full[:, :2].T, full[:, 2:]
     for p in (-0.7, -0.3 + 4.0j, -2.0 + 30.0j):
-        solution = closed_adjoint(plant, solver, p, right)
+        solution = closed_adjoint(plant, open_adjoints(plant, solver, [p], right)[0], right)
         V = solution.real(np.array([[1, -1j]]))  # [Re V, Im V]
         B = space.B @ plant.B
         dense = np.linalg.solve((space.A - B @ K_full + p * space.E).T, W_full)
@@ -55,6 +55,35 @@ def test_shifted_adjoint_solve_is_the_dense_one(name: str, tissue: str) -> None:
         theirs = np.vstack([dense[: 2 * s], dense[own], dense[below]])
         scale = np.abs(dense).max()
         assert np.abs(ours - theirs).max() < 1e-9 * scale  # condition of the dense matrix times rounding
+    solver.destroy()
+
+
+@pytest.mark.parametrize("name", ["one_way", "two_way_drag_in_space"])
+def test_solution_beside_another_shift_is_that_of_the_new_right_hand_side(name: str) -> None:
+    """Solved with again on one rank; on more the ranks solve with as many shifts at the same time."""
+    problem = problem_of(name)
+    plant, layout, rng = Plant(problem), problem.layout, np.random.default_rng(5)
+    hand = rng.standard_normal((2 * layout.n_s, 3))
+    local = np.sin(np.arange(1, 4) * (1 + layout.nodes.reshape(-1, 1)))
+    solver = make_shifted(plant.system, "gathered")
+    right = adjoint_rhs(plant, solver, Block(hand, np.vstack([local, -local])))
+    shifts = [-0.3 + 4.0j, -2.0 + 30.0j, -0.7 + 0j]
+    coefficients = rng.standard_normal((1, 2)) + 1j * rng.standard_normal((1, 2))
+    small = rng.standard_normal((2, 3))
+    together = open_adjoints(plant, solver, shifts, right)
+    assert len(together) == min(layout.comm.size, 3)
+    assert len(open_adjoints(plant, solver, [-1.0, -1.01, -9.0], right)) == 1  # too near
+    first, *others = [open_adjoints(plant, solver, [p], right)[0] for p in shifts]
+    V = closed_adjoint(plant, first, right)
+    new = right.plus(mass_rhs(plant, V.real(coefficients)), small)
+    for beside, alone in zip(together[1:], others, strict=False):
+        assert np.abs(beside.b - alone.b).max(initial=0) <= 1e-12 * np.abs(alone.b).max(initial=0)  # rounding
+    for solution in others:
+        moved = solution.moved(V, coefficients, small)
+        again = open_adjoints(plant, solver, [solution.p], new)[0]
+        for ours, theirs in ((moved.hand, again.hand), (moved.b, again.b)):
+            # rounding of S(p), whose condition is 1e4 here, and of the difference of two solutions
+            assert np.abs(ours - theirs).max(initial=0) <= 1e-9 * np.abs(theirs).max(initial=1e-9)
     solver.destroy()
 
 
