@@ -14,10 +14,8 @@ torque. The midpoint rule over a step h, with M_a, G_a and v at half of it by ex
 so that MuJoCo solves for robot and tissue together, contact included: the bracket goes into its mass matrix, which is
 factored again, the right-hand side is a generalised force, and action is reaction.
 
-The linear momentum P of all tissue, rigid motion included, changes over a step by what the body gave, but for an error
-of the second order in h, from axes and gyroscopic forces at the start of it. In a tree that begins with a free joint
-what P is above the sum due is taken from the body in the next step, so that the errors do not add up. After a change
-of the state by the user the sum begins anew. `step.c` has the small algebra; without a compiler NumPy does it.
+A robot that is free keeps its momenta beside that, see `flight.py`. `step.c` has the small algebra; without a compiler
+NumPy does it.
 """
 
 from __future__ import annotations
@@ -33,6 +31,7 @@ from softgrasp.fem.frame.rotation import cross_matrix
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.bridges.compiled import CompiledStep
+from softgrasp.reduction.bridges.flight import FreeFlight
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.system import ModelError
 from softgrasp.reduction.turning.model import TurningModel
@@ -107,8 +106,7 @@ class MujocoTissue:
         self._loads, self._forces = np.ascontiguousarray(sums), np.hstack([small.K, small.D + dt / 2 * small.K])
         self._turns = np.vstack([np.zeros((2, 9)), AXES.reshape(3, 9)])
         self._J, self._Jd, self._six = np.zeros((6, nv)), np.zeros((6, nv)), np.zeros((6, 6))
-        self._rigid, self._due, self._reached = np.ascontiguousarray(system.rigid), np.zeros(3), np.zeros(0)
-        self._keeps = _floats(self.mujoco, mj_model, self.body)
+        self._flight = FreeFlight.of(self.mujoco, mj_model, self.body)
         self._rows = np.repeat(np.arange(nv, dtype=np.intc), mj_model.M_rownnz)  # of the lower triangle in M
         self._columns = np.array(mj_model.M_colind, dtype=np.intc)
         self._code = CompiledStep.of(self)
@@ -138,6 +136,9 @@ class MujocoTissue:
         mujoco.mj_step1(model, data)
         mujoco.mj_jacBody(model, data, self._J[:3], self._J[3:], self.body)
         mujoco.mj_jacDot(model, data, self._Jd[:3], self._Jd[3:], data.xpos[self.body], self.body)
+        flight = self._flight
+        if flight is not None:
+            flight.rest(data)
         if self._code is None:
             self._in_numpy(data)
             return
@@ -146,43 +147,44 @@ class MujocoTissue:
         mujoco.mj_step2(model, data)
         if not self._code.end():
             raise ModelError(NOT_FINITE)
+        if flight is not None and not flight.is_held(data):
+            flight.rest(data)
+            self._code.keep()
         self.a, self.e, self.wrench = self._code.state()
 
     def _in_numpy(self, data: Any) -> None:
         """The step after the Jacobian is known."""
-        mujoco, model, six, rigid = self.mujoco, self.mj_model, self._six, self._rigid
+        mujoco, model, six, flight = self.mujoco, self.mj_model, self._six, self._flight
         Q = data.xmat[self.body].reshape(3, 3)
         six[:3, :3] = six[3:, 3:] = Q.T
         J, before = six @ self._J, data.qvel.copy()
-        b, xi = six @ (self._Jd @ before), J @ before
-        held, goes_on = Q @ self._momentum(xi), self._goes_on(data)
-        inertia, force, right, G = self._known(xi[3:], Q.T @ model.opt.gravity)
-        given = force[:3] + _skew(xi[3:]) @ rigid[:3, 3:] @ xi[3:]
-        if goes_on:
-            force[:3] += Q.T @ (held - self._due) / self.dt
+        b = six @ (self._Jd @ before)
+        if flight is not None:
+            flight.depart(data, *self._moved())
+        inertia, force, right, G = self._known(J[3:] @ before, Q.T @ model.opt.gravity)
         data.M[:] += (J.T @ inertia @ J)[self._rows, self._columns]
         mujoco.mj_factorM(model, data)
         user = data.qfrc_applied.copy()
-        data.qfrc_applied[:] -= J.T @ (inertia @ b + force)
+        given = -(J.T @ (inertia @ b + force))
+        data.qfrc_applied[:] += given
         mujoco.mj_step2(model, data)
         data.qfrc_applied[:] = user
         # the velocity that was reached, with damping of joints that MuJoCo treats implicitly
         acceleration = J @ ((data.qvel - before) / self.dt) + b
         self._advance(acceleration, right, G)
         self.wrench = -(inertia @ acceleration + force)
-        self._due = held + self.dt * Q @ (given + (inertia + rigid)[:3] @ acceleration)
-        self._reached = np.concatenate([data.qpos, data.qvel, self.a, self.e])
+        if flight is not None and not flight.is_held(data):
+            flight.rest(data)
+            flight.keep(data, self.dt, *self._moved(), given)
 
-    def _goes_on(self, data: Any) -> bool:
-        """Whether MuJoCo and tissue are where the last step left them; a quaternion may have been normalised again."""
-        state = np.concatenate([data.qpos, data.qvel, self.a, self.e])
-        same = state.shape == self._reached.shape
-        return self._keeps and same and bool(np.all(np.abs(state - self._reached) <= 1e-14 * np.abs(self._reached)))
-
-    def _momentum(self, xi: Array) -> Array:
-        """P of all tissue in the axes of the body, at its velocity xi (6,), (3,)."""
-        m, y = self.small.G[:, :3].T @ self.a, self.small.G[:, :3].T @ self.e
-        return np.asarray(self._rigid[:3] @ xi + y + _skew(xi[3:]) @ m)
+    def _moved(self) -> tuple[Array, Array]:
+        """M_a and G_a'e, which give the momenta of the deformation, (6, 6) and (6,)."""
+        k = len(self.a)
+        integrals = self._integrals @ np.stack([self.a, self.e], axis=1)
+        C = np.dot(self.a, integrals[: 9 * k].reshape(9, k, 2))
+        F, moving = C[:, 1].reshape(3, 3), self.small.G.T @ self.e
+        moving[3:] += F[1, 2] - F[2, 1], F[2, 0] - F[0, 2], F[0, 1] - F[1, 0]
+        return _added(integrals[9 * k :, 0], C[:, 0])[0], moving
 
     def _known(self, spin: Array, g: Array) -> tuple[Array, Array, Array, Array]:
         """M_a - G_a'S^-1 G_a, G_a'S^-1 r + v, r and G_a at the middle of the step."""
@@ -199,21 +201,17 @@ class MujocoTissue:
         turned = (turns @ pairs.reshape(9, 2 * k)).reshape(5, k, 2)
         C = np.dot(middle[:, 0], pairs.reshape(9, k, 2))  # int rho z_k z_l and int rho z_k e_l
         m = sums[:3, 0]
+        added, whole = _added(sums[:, 0], C[:, 0])
         G = self.small.G.copy()
         G[:, 3:] += turned[2:, :, 0].T
         load[:3], load[3:] = g, -turns[0]
         right = self._loads @ load - turned[0, :, 0] - turned[1, :, 1] - self._forces @ np.concatenate((a, e))
         pulled = G.T @ self.inverse
-        inertia, lever, B = -(pulled @ G), _skew(m), sums[3:, 0].reshape(3, 3)
-        whole = B + B.T + C[:, 0].reshape(3, 3)
-        inertia[:3, 3:] -= lever
-        inertia[3:, :3] += lever
-        inertia[3:, 3:] += whole.trace() * EYE - whole
-        force = pulled @ right
+        inertia, force = added - pulled @ G, pulled @ right
         moving = sums[3:, 1].reshape(3, 3) + C[:, 1].reshape(3, 3).T  # int rho e_k (r + z)_l
         V = square @ whole + W @ (2 * moving)
         force[:3] += square @ m + W @ (2 * sums[:3, 1])
-        force[3:] -= lever @ g
+        force[3:] -= added[3:, :3] @ g
         (_, xy, xz), (yx, _, yz), (zx, zy, _) = V.tolist()
         force[3:] += (zy - yz, xz - zx, yx - xy)
         return inertia, force, right, G
@@ -227,15 +225,13 @@ class MujocoTissue:
         self._past[:], self._rate[:] = change, acceleration[3:]
 
 
-def _skew(m: Array) -> Array:
-    x, y, z = m.tolist()
-    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
-
-
-def _floats(mujoco: Any, model: Any, body: int) -> bool:
-    """Whether the tree of a body begins with a free joint."""
-    root = model.body_rootid[body]
-    return bool(model.body_jntnum[root] and model.jnt_type[model.body_jntadr[root]] == mujoco.mjtJoint.mjJNT_FREE)
+def _added(sums: Array, C: Array) -> tuple[Array, Array]:
+    """M_a (6, 6) and int rho (z r' + r z' + z z') (3, 3) from the integrals of a deformation, (12,) and (9,)."""
+    x, y, z = sums[:3].tolist()
+    lever, B, inertia = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))), sums[3:].reshape(3, 3), np.zeros((6, 6))
+    whole = B + B.T + C.reshape(3, 3)
+    inertia[:3, 3:], inertia[3:, :3], inertia[3:, 3:] = -lever, lever, whole.trace() * EYE - whole
+    return inertia, whole
 
 
 def _mujoco() -> Any:

@@ -145,7 +145,7 @@ int softgrasp_free(const Free *t) {
     for (int j = 0; j < 3; j++) fall[i] += t->g[j] * t->Q[3 * j + i];
   for (int p = 0; p < dd * k; p++) t->held[p] = dot(k, t->E + (size_t)p * k, t->a);
   for (int count = 0; count < t->most; count++) {
-    double work[6] = {0}, B[9] = {0}, X[9] = {0}, C[9] = {0}, W[9] = {0}, W2[9] = {0}, rate[6], size = 0, norm = 0;
+    double work[6] = {0}, B[9] = {0}, X[9] = {0}, C[9] = {0}, W[9] = {0}, W2[9] = {0}, rate[6], size = 0, norm = 0, terms = 0;
     for (int i = 0; i < k; i++) {
       t->end[i] = t->a[i] + 2 * t->w[i];
       for (int c = 0; c < n_s; c++) work[t->free[c]] += t->G[i * n_s + c] * t->w[i];
@@ -171,7 +171,13 @@ int softgrasp_free(const Free *t) {
     }
     for (int i = 0; i < k; i++) {
       double left = dot(k, t->still + (size_t)i * k, t->w), right = -dot(k, t->K + (size_t)i * k, t->a);
-      for (int c = 0; c < n_s; c++) right -= t->G[i * n_s + c] * rate[t->free[c]];
+      double term = 0;
+      for (int j = 0; j < k; j++) term += fabs(t->still[(size_t)i * k + j] * t->w[j]);
+      for (int c = 0; c < n_s; c++) {
+        const int f = t->free[c];
+        right -= t->G[i * n_s + c] * rate[f];
+        term += s * fabs(t->G[i * n_s + c]) * (fabs(t->xi[f]) + fabs(t->start[f]));
+      }
       for (int p = 0; p < dd; p++) {
         const int at = 3 * (p / d) + p % d, q = p * k + i;
         if (p / d == p % d) right += s * t->Y[q];
@@ -179,10 +185,10 @@ int softgrasp_free(const Free *t) {
         left += (2 * s * W[at] + W2[at]) * t->moved[q];
       }
       t->right[i] = right, t->R[i] = left - right;
-      size += right * right, norm += t->R[i] * t->R[i];
+      size += right * right, terms += term * term, norm += t->R[i] * t->R[i];
     }
     *t->scale = fmax(*t->scale, sqrt(size));
-    if (sqrt(norm) <= t->tol * *t->scale) return count;
+    if (sqrt(norm) <= fmax(t->tol * *t->scale, t->rounding * sqrt(terms))) return count;
     if (!isfinite(norm)) return -1;
     for (int i = 0; i < k; i++) t->w[i] -= dot(k, t->inverse + (size_t)i * k, t->R);
   }

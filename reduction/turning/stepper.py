@@ -19,14 +19,14 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.frame.balance import HandBalance, HandPlace, Travel
+from softgrasp.fem.frame.balance import ROUNDING, HandBalance, HandPlace, Travel
 from softgrasp.fem.frame.integrals import Sums, square
 from softgrasp.fem.frame.rotation import cross_matrix, spatial
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.turning.compiled import FreeStep
 
 MOST = 100  # largest number of iterations of a step with a free hand [1]
-TOL = 1e-13  # of such a step, over the largest load
+TOL = 1e-13  # of such a step, over the largest load; where that is below the rounding of its terms, that ends it
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,8 @@ class TurningSteps:
             left, right = self._system(xi[3:], load)
             R = left @ w - right
             self.scale = max(self.scale, float(np.linalg.norm(right)))
-            if np.linalg.norm(R) <= TOL * self.scale:
+            terms = np.abs(self.still) @ np.abs(w) + s * np.abs(small.G) @ (np.abs(xi) + np.abs(hand.xi))[balance.free]
+            if np.linalg.norm(R) <= max(TOL * self.scale, ROUNDING * float(np.linalg.norm(terms))):
                 self._advance(w, xi[3:])
                 self.iterations += count
                 return xi

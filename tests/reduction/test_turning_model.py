@@ -12,7 +12,7 @@ import scipy.integrate
 from mpi4py import MPI
 
 import softgrasp as sg
-from softgrasp.fem.frame.balance import HandPlace
+from softgrasp.fem.frame.balance import HandBalance, HandPlace
 from softgrasp.fem.frame.integrals import Sums, in_space
 from softgrasp.fem.frame.rotation import cross_matrix, rotation_matrix, spatial
 from softgrasp.fem.petsc import Array, to_scipy
@@ -21,6 +21,7 @@ from softgrasp.reduction.bases.states import BasisError
 from softgrasp.reduction.system import ModelError
 from softgrasp.reduction.turning.compiled import FreeStep
 from softgrasp.reduction.turning.model import TurningModel
+from softgrasp.reduction.turning.stepper import TurningSteps
 
 TURN: dict[str, Any] = {"rotation": True, "frame": "hand", "reaction": True}
 DAMPED = {"damping": {"kind": "kelvin-voigt", "beta": 0.01}, "gravity": [0.0, -2.0]}
@@ -99,6 +100,32 @@ def test_a_free_hand_keeps_energy_and_momenta(comm: MPI.Intracomm) -> None:
         assert np.ptp(each[:, part], axis=0).max() < 1e-11 * np.abs(each[:, part]).max()  # iterated to 1e-13
     assert np.linalg.norm(run.q_s[-1, 3:]) > 0.5  # it turns
     assert run.energy[-1] > 1e-6 * each[0, 0]  # and swings
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_hand_that_spins_freely_may_have_the_shortest_steps(
+    comm: MPI.Intracomm, compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its loads are small beside the inertia of a step, whose rounding then ends the iteration."""
+    model = block(comm, 30)
+    rom = sg.reduce(model, sg.simulate(model, force=push), "craig_bampton", N=24)
+    if not compiled:
+        monkeypatch.setattr(FreeStep, "of", lambda *of: None)
+    ends = []
+    for dt, steps in ((1e-5, 40), (4e-5, 10)):
+        system, rest = rom.at(dt), np.zeros(rom.k)
+        inertia, place = (
+            in_space(rom.M_hand + system.rigid),
+            HandPlace.of(np.zeros(6), np.array([0, 0, 0, 0.5, 2, 0.3])),
+        )
+        balance, last = HandBalance(inertia, inertia, np.zeros(3), list(range(6)), dt), place.xi
+        march = TurningSteps(system.small, dt, rest, rest, place.xi[3:])
+        for _ in range(steps):
+            xi = march.free(balance, place, np.zeros(6), 2 * place.xi - last)
+            place, last = place.moved(xi, dt), xi
+        ends.append(np.concatenate([1e5 * march.a, place.v]))
+    assert np.abs(ends[1] - ends[0]).max() < 2e-2 * np.abs(ends[0]).max()  # the longer step's error
 
 
 @pytest.mark.serial
