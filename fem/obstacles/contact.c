@@ -248,21 +248,53 @@ int softgrasp_finish(Flat *f, int n, const double *v) {
   return most > f->still;
 }
 
+/* Jump of the velocity under vectors t (4, ways) on `count` columns of M^-1, each axis, or one direction, by itself. */
+static void spread(const Flat *f, int count, const int *column, const double *t, int ways) {
+  const int nodes = f->here / f->d;
+  for (int a = 0; a < ways; a++) {
+    double *u = f->spread + (size_t)a * nodes, s[4];
+    const double *c[4];
+    for (int j = 0; j < 4; j++) {
+      s[j] = j < count ? t[j * ways + a] : 0;
+      c[j] = f->shares + (size_t)(f->ends ? 0 : column[j < count ? j : 0]) * nodes;
+    }
+    if (f->ends)
+      for (int j = 0; j < count; j++)
+        for (int k = f->ends[column[j]]; k < f->ends[column[j] + 1]; k++) u[f->reached_nodes[k]] += s[j] * f->shares[k];
+    else
+      for (int k = 0; k < nodes; k++) u[k] += (s[0] * c[0][k] + s[1] * c[1][k]) + (s[2] * c[2][k] + s[3] * c[3][k]);
+  }
+}
+
 /* Impulses y of the pressed rows at the end of step n: tables, velocities v on the rows here, momentum, hand. */
 void softgrasp_strike(const Flat *f, int n, double *v) {
-  const int d = f->d, m = f->n_s, own = f->feels;
+  const int d = f->d, m = f->n_s, own = f->feels, nodes = f->here / d;
   double *impulse = f->impulse + (size_t)n * f->obstacles * d, *force = f->force + (size_t)n * f->obstacles * d;
-  double *kick = f->kick + (size_t)n * m, a[MODES] = {0}, b[MODES] = {0}, wrench[MODES] = {0}, work = 0, sum[3] = {0};
+  double *kick = f->kick + (size_t)n * m, a[MODES] = {0}, b[MODES] = {0}, wrench[MODES] = {0}, work = 0, t[12] = {0};
+  const double *only = 0;
+  int ways = 1, count = 0, columns[4], last = -1;
   for (int j = 0; j < f->k; j++) {
+    if (f->y[j] == 0) continue;
+    if (only && only != along(f, f->row + 4 * j)) ways = d;
+    only = along(f, f->row + 4 * j);
+    last = j;
+  }
+  memset(f->spread, 0, sizeof(double) * ways * nodes);
+  for (int j = 0; j <= last; j++) {
     if (f->y[j] == 0) continue;
     const int *row = f->row + 4 * j, o = row[0];
     const double *e = along(f, row), *S = f->starts + (size_t)f->column[j] * d * m;
     for (int i = 0; own && i < m; i++) b[i] += f->reach[(size_t)j * m + i] * f->y[j];
+    if (!count || columns[count - 1] != f->column[j]) { /* rows of a pair share a column of M^-1: one pass over it */
+      if (count == 4) spread(f, count, columns, t, ways), count = 0, memset(t, 0, sizeof t);
+      columns[count++] = f->column[j];
+    }
+    if (ways == 1) t[count - 1] = f->y[j];
     for (int c = 0; c < d; c++) {
       const int u = row[1] * d + c;
       const double y = f->y[j] * e[c];
       impulse[o * d + c] += y;
-      sum[c] += y;
+      if (ways > 1) t[(count - 1) * d + c] += y;
       force[o * d + c] += y / f->dt;
       work += y * f->v[u];
       for (int i = 0; i < m; i++) {
@@ -272,14 +304,10 @@ void softgrasp_strike(const Flat *f, int n, double *v) {
     }
     work += f->y[j] * dot(f->k, f->A + (size_t)j * f->ld, f->y) / 2;
     add_to_r(f, j, f->s * f->y[j]);
-    int next = j + 1; /* rows of a pair share a column of M^-1: one pass over it */
-    while (next < f->k && f->y[next] == 0) next++;
-    if (next < f->k && f->column[next] == f->column[j]) continue;
-    const int to = f->ends[f->column[j] + 1];
-    for (int k = f->ends[f->column[j]]; k < to; k++)
-      for (int c = 0; c < d; c++) v[(size_t)f->reached_nodes[k] * d + c] += f->shares[k] * sum[c];
-    memset(sum, 0, sizeof sum);
   }
+  spread(f, count, columns, t, ways);
+  for (int c = 0; c < d; c++)
+    for (int k = 0; k < nodes; k++) v[k * d + c] += ways == 1 ? only[c] * f->spread[k] : f->spread[c * nodes + k];
   for (int i = 0; own && i < m; i++) {
     a[i] = dot(m, f->H + i * m, b);
     f->vs[(size_t)(n + 1) * m + i] += a[i];
@@ -314,16 +342,14 @@ int softgrasp_stop(Flat *f, int n, double *v) {
   }
   for (int i = 0; i < count; i++) y[i] = f->b[f->stopped[i]];
   solve(f->ld, count, f->LA, y);
-  for (int i = 0; i < count; i++) { /* without the ridge's error */
-    const double *A = f->A + (size_t)f->stopped[i] * f->ld;
-    b[i] = f->b[f->stopped[i]];
-    for (int j = 0; j < count; j++) b[i] -= A[f->stopped[j]] * y[j];
-  }
-  solve(f->ld, count, f->LA, b);
   memset(f->y, 0, f->k * sizeof(double));
+  for (int i = 0; i < count; i++) f->y[f->stopped[i]] = y[i];
+  for (int i = 0; i < count; i++) /* without the ridge's error */
+    b[i] = f->b[f->stopped[i]] - dot(f->k, f->A + (size_t)f->stopped[i] * f->ld, f->y);
+  solve(f->ld, count, f->LA, b);
   for (int i = 0; i < count; i++) {
-    f->y[f->stopped[i]] = y[i] + b[i];
-    taken += (y[i] + b[i]) * f->b[f->stopped[i]] / 2;
+    f->y[f->stopped[i]] += b[i];
+    taken += f->y[f->stopped[i]] * f->b[f->stopped[i]] / 2;
   }
   f->energy[2] += taken;
   softgrasp_strike(f, n, v);

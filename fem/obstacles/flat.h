@@ -50,8 +50,9 @@ typedef struct {
   const double *A;          /* N M^-1 N', with the hand's part (struck, struck) */
   double *LA, *y;           /* factor of A at the stopped rows, impulses (k) */
   const int *column;        /* column of M^-1 of each row (struck) */
-  const int *ends, *reached_nodes; /* its entries here: where each column begins, their nodes */
+  const int *ends, *reached_nodes; /* its entries here: where each column begins, their nodes; 0 where all are kept */
   const double *shares;     /* and values */
+  double *spread;           /* room for a jump of the velocity (here) */
   const double *starts;     /* G'M^-1 of each column and axis (columns, d, n_s) */
   const double *reach, *X_hand; /* N (T - M^-1 G) (struck, n_s), M^-1 G here (n_s, here) */
   const double *H, *GX;     /* (M_hand + M_rigid - G'M^-1 G)^-1, G'M^-1 G (n_s, n_s) */

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 Key = tuple[int, int]
 """A boundary node and a direction, by their numbers."""
+TOGETHER = 16  # columns of one call, which MUMPS solves as one block
 
 
 class Responses:
@@ -18,13 +19,14 @@ class Responses:
 
     Args:
         directions: unit vectors, (m, d).
-        respond: response to forces (p d,) on the boundary, on the rows here and on the boundary (p d,). Collective.
+        respond: responses to forces (p d, k) on the boundary: on the rows here, and on it (p d, k). Collective.
         reach: T - theta S^-1 G on the boundary of a two-way hand, (p d, n_s), and its L^-1 / s^2; None where the hand
             feels no tissue.
 
     Attributes:
         keys: boundary node and direction of every column, by their numbers, (capacity, 2), the first ``count`` of them.
         where: column of every key.
+        blocks: numbers of columns that were solved for together, on which their bits depend.
         columns: response of every key here, (rows here, capacity).
         surface: the same on the boundary, (p d, capacity).
         G: directions times responses, with the hand's part where it is two-way, (capacity, capacity).
@@ -42,6 +44,7 @@ class Responses:
         self.d = directions.shape[1]
         self.keys = np.zeros((0, 2), dtype=int)
         self.where: dict[Key, int] = {}
+        self.blocks: list[int] = []
         self.columns, self.surface = np.zeros((0, 0), order="F"), np.zeros((size, 0), order="F")
         self.G = np.zeros((0, 0))
         self.B = np.zeros((0, 0 if reach is None else len(reach[1])))
@@ -53,27 +56,40 @@ class Responses:
 
     def enter(self, keys: list[Key]) -> None:
         """Make the columns of the keys that have none, in the order given. Collective."""
-        for key in keys:
-            if key not in self.where:
-                self._add(key)
+        new = [key for key in dict.fromkeys(keys) if key not in self.where]
+        for first in range(0, len(new), TOGETHER):
+            self._add(new[first : first + TOGETHER])
 
-    def _add(self, key: Key) -> None:
-        node, direction = key
-        n, force = self.directions[direction], np.zeros(self.size)
-        force[node * self.d : (node + 1) * self.d] = n
-        column, there = self.respond(force)
-        k = self.count
-        if k == len(self.G):
-            self._grow(max(16, 2 * k), len(column))
-        self.keys[k], self.where[key] = key, k
-        self.columns[:, k], self.surface[:, k] = column, there
-        nodes, numbers = self.keys[: k + 1].T
-        products = np.einsum("ij,ij->i", self.directions[numbers], there.reshape(-1, self.d)[nodes])
+    def again(self, keys: list[Key], blocks: list[int]) -> None:
+        """Make the first columns with the bits of another run, which solved for them in these blocks. Collective."""
+        for block in blocks:
+            self._add(keys[self.count : self.count + block])
+
+    def _add(self, keys: list[Key]) -> None:
+        self.blocks.append(len(keys))
+        forces = np.zeros((self.size, len(keys)))
+        for j, (node, direction) in enumerate(keys):
+            forces[node * self.d : (node + 1) * self.d, j] = self.directions[direction]
+        columns, there = self.respond(forces)
+        have, k = self.count, self.count + len(keys)
+        if k > len(self.G):
+            self._grow(max(16, 2 * k), len(columns))
+        self.keys[have:k] = keys
+        self.where.update(zip(keys, range(have, k), strict=True))
+        self.columns[:, have:k], self.surface[:, have:k] = columns, there
+        for j in range(have, k):
+            self._relate(j)
+
+    def _relate(self, j: int) -> None:
+        """Products of column j with those before it."""
+        nodes, numbers = self.keys[: j + 1].T
+        there = self.surface[:, j].reshape(-1, self.d)
+        products = np.einsum("ij,ij->i", self.directions[numbers], there[nodes])
         if self.reach is not None:
             reach, inverse = self.reach
-            self.B[k] = n @ reach[node * self.d : (node + 1) * self.d]
-            products = products + self.B[: k + 1] @ (inverse @ self.B[k])
-        self.G[k, : k + 1] = self.G[: k + 1, k] = products
+            self.B[j] = self.directions[numbers[j]] @ reach[nodes[j] * self.d : (nodes[j] + 1) * self.d]
+            products = products + self.B[: j + 1] @ (inverse @ self.B[j])
+        self.G[j, : j + 1] = self.G[: j + 1, j] = products
 
     def _grow(self, size: int, rows: int) -> None:
         def larger(x: Array, shape: tuple[int, int], order: Literal["C", "F"] = "C") -> Array:

@@ -28,7 +28,9 @@ from softgrasp.fem.shown import counted
 
 FORMAT = 7
 FRICTION = 3  # form of the sets of friction in them
+CONTACT = 2  # form of what contact carries on
 ITERATIONS = 2  # form of the iterations of steps at finite strain or in a frame
+COMPILED = "compiled contact"
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # keys of [output] that change no number of a run
 FREE = ("name", "description", "reduction", "study")
 OLD = ("*step*-rank*", "*frame*.npz")  # patterns of the files that a new manifest makes useless
@@ -164,6 +166,12 @@ def _fitting(scene: Scene, ranks: int, manifest: Path, entry: dict[str, Any]) ->
     _same_ranks(manifest, entry, ranks)
     if entry["scene_hash"] == _numbers_hash(scene):
         for name, form in _forms(scene).items():
+            if name == COMPILED and entry.get(name) != form:
+                raise CheckpointError(
+                    f"{manifest} was written {'without' if form else 'with'} compiled contact, which this machine "
+                    f"{'has' if form else 'lacks: install cffi and a C compiler there, or name one in CC'}; the two "
+                    "continue with other bits: resume where the run began, or run again without --resume"
+                )
             if entry.get(name) != form:
                 raise CheckpointError(
                     f"{manifest} was written by another version of softgrasp, which continues "
@@ -189,7 +197,12 @@ def _forms(scene: Scene) -> dict[str, int]:
     effects = scene.effects
     rubs = bool(effects.obstacles) and any(entry.friction for entry in scene.obstacle or [])
     iterates = effects.finite_strain is not None or effects.frame is not None
-    return ({"friction": FRICTION} if rubs else {}) | ({"iterations": ITERATIONS} if iterates else {})
+    forms: dict[str, int] = ({"friction": FRICTION} if rubs else {}) | ({"iterations": ITERATIONS} if iterates else {})
+    if effects.obstacles:
+        from softgrasp.fem.obstacles.compiled import contact_library  # only scenes with contact pay for it
+
+        forms |= {"contact": CONTACT, COMPILED: contact_library() is not None}
+    return forms
 
 
 def _numbering(layout: BlockLayout) -> Array:

@@ -118,6 +118,7 @@ class FlatContact(Contact):
         self.point(q=self.q, q0=self.q)
         self.c.softgrasp_look(self.f)  # the bits of a run that is not restarted here
         gaps[:], self.z, self.gaps, self.f.whole = self.after, z, gaps, whole
+        self.table.gap[n] = self.least
 
     def _place(self, n: int) -> None:
         """Put moving half-spaces where they are at step n."""

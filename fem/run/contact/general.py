@@ -110,14 +110,13 @@ class Contact:
         """Directions in which the nodes that an obstacle presses have responses, (m, d)."""
         return obstacle.shape.normal[None] if isinstance(obstacle.shape, HalfSpace) else np.eye(self.d)
 
-    def _respond(self, force: Array) -> tuple[Array, Array]:
-        """S^-1 of forces on the boundary. Collective."""
-        b = self.b.array_w
-        b[:] = 0.0
-        b[self.places] = self.surface.on_nodes(force)[self.order]
-        self.midpoint.solver.solve(self.b, self.y)
-        column = self.y.array_r
-        return column, self._take(column)
+    def _respond(self, forces: Array) -> tuple[Array, Array]:
+        """S^-1 of forces (p d, k) on the boundary. Collective."""
+        b = np.zeros((len(self.b.array_r), forces.shape[1]), order="F")
+        for j, force in enumerate(forces.T):
+            b[self.places, j] = self.surface.on_nodes(force)[self.order]
+        columns = self.midpoint.solver.columns(b)
+        return columns, np.column_stack([self._take(column) for column in columns.T])
 
     def _take(self, x: Array) -> Array:
         """Values on the boundary of a vector on the rows here. Collective."""
@@ -368,8 +367,8 @@ class Contact:
         """Record and sets of a restart file, see :class:`softgrasp.fem.run.checkpoint.RestartState`."""
         keys = self.responses.keys[: self.responses.count]
         parts: list[NDArray[Any]] = [
-            self.table.energy, np.array([self.fastest]), self.small.tally, keys.ravel(), self.strike.nodes(),
-            *self._sets(),
+            self.table.energy, np.array([self.fastest]), self.small.tally, keys.ravel(),
+            np.array(self.responses.blocks), self.strike.nodes(), *self._sets(),
         ]  # fmt: skip
         sizes = np.array([len(parts), *(len(part) for part in parts)])
         return {"solver_rows": self.table.packed(self.n + 1), "solver_numbers": np.concatenate([sizes, *parts])}
@@ -383,9 +382,9 @@ class Contact:
         self.table.unpack(rows)
         count = 1 + int(numbers[0])
         ends = np.cumsum(numbers[1:count].astype(int))
-        energy, fastest, tally, keys, struck, *sets = np.split(numbers[count:], ends)[:-1]
+        energy, fastest, tally, keys, blocks, struck, *sets = np.split(numbers[count:], ends)[:-1]
         self.table.energy[:], self.fastest, self.small.tally[:] = energy, float(fastest[0]), tally
-        self.responses.enter([(int(i), int(k)) for i, k in keys.reshape(-1, 2)])
+        self.responses.again([(int(i), int(k)) for i, k in keys.reshape(-1, 2)], blocks.astype(int).tolist())
         self.strike.restore(struck.astype(int))
         self._resume(sets)
 

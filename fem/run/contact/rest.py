@@ -34,11 +34,11 @@ def resting(contact: Contact, q: Array, time: Time) -> Array:
     free = equilibrium(system, name, time)
     with factored_stiffness(system, name, reproducible=time.reproducible) as factor:
 
-        def respond(force: Array) -> tuple[Array, Array]:
-            b = np.zeros((layout.n_local, 1))
-            b[surface.rows, 0] = surface.on_nodes(force)[surface.mine]
-            column = factor.columns(b, "the response to an obstacle")[:, 0]
-            return column, surface.gather(column)
+        def respond(forces: Array) -> tuple[Array, Array]:
+            b = np.zeros((layout.n_local, forces.shape[1]))
+            b[surface.rows] = np.column_stack([surface.on_nodes(force) for force in forces.T])[surface.mine]
+            columns = factor.columns(b, "the response to an obstacle")
+            return columns, np.column_stack([surface.gather(column) for column in columns.T])
 
         responses = Responses(contact.responses.directions, respond, contact.p * contact.d)
         return free + _forces(contact, responses, q, surface.gather(free))

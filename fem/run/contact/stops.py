@@ -17,6 +17,8 @@ from softgrasp.fem.system import BlockSystem
 class Stopped(Protocol):
     """A contact whose rows `contact.c` stops, see :class:`softgrasp.fem.run.contact.flat.FlatContact`."""
 
+    ffi: Any
+    """Its cffi."""
     f: Any
     """Struct of `flat.h`."""
     W: Array
@@ -87,18 +89,20 @@ class Stops:
             answers = np.einsum("ij,kj->ki", np.linalg.inv(impulses.H), self.reach[new])
             more += np.einsum("ik,jk->ij", self.reach[:count], answers)
         self.A[:count, new], self.A[new, :count] = more, more.T
-        ends, nodes, shares = mass.entries()
         f.struck = count
-        contact.point(
-            column=at.astype(np.intc), ends=ends.astype(np.intc), reached_nodes=nodes.astype(np.intc), shares=shares,
-            starts=self._starts(),
-        )  # fmt: skip
+        contact.point(column=at.astype(np.intc), starts=self._starts())
+        if isinstance(columns := mass.columns, np.ndarray):
+            f.ends = contact.ffi.NULL
+            contact.point(shares=columns.T)
+        else:
+            contact.point(ends=columns.indptr, reached_nodes=columns.indices, shares=columns.data)
 
     def _begin(self) -> None:
         """Room for all rows, and what impulses do to the hand. Collective."""
         contact, impulses = self.contact, self.contact.strike.reactions()
         self.A, self.reach = np.zeros((1, 1)), np.zeros((1, contact.f.n_s))
         self.grow(len(contact.W))
+        contact.point(spread=np.zeros(contact.f.here))
         if contact.f.feels:
             contact.point(
                 X_hand=np.ascontiguousarray(impulses.X.T), H=np.ascontiguousarray(np.linalg.inv(impulses.H)),

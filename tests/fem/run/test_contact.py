@@ -11,9 +11,10 @@ import scipy.linalg
 from mpi4py import MPI
 from scipy.optimize import nnls
 
-from softgrasp.fem.errors import Paused, SceneError, SoftgraspError
+from softgrasp.fem.errors import CheckpointError, Paused, SceneError, SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.surface import make_surface
+from softgrasp.fem.obstacles.compiled import contact_library
 from softgrasp.fem.obstacles.small import SmallProblem
 from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
@@ -218,7 +219,9 @@ def test_a_free_hand_rests_with_its_weight_on_the_table() -> None:
     assert force[1] == pytest.approx(weight, rel=1e-8)  # what is left of the motion after 60 s
 
 
-@pytest.mark.parametrize("overrides", [[TABLE, BETA], [DISC, *TWO, *SHORT], [DISC, *SHORT]])
+@pytest.mark.parametrize(
+    "overrides", [[TABLE, BETA], [SLANTED, "time.solver='mumps'"], [DISC, *TWO, *SHORT], [DISC, *SHORT]]
+)
 def test_restart_in_contact_repeats_the_bits(overrides: list[str], mpi_tmp_path: Path) -> None:
     whole, model = run(*overrides), build("paper_forward", [*SMALL, ON, *overrides])
     with pytest.raises(Paused):
@@ -230,6 +233,25 @@ def test_restart_in_contact_repeats_the_bits(overrides: list[str], mpi_tmp_path:
         assert np.array_equal(getattr(again.contact, name), getattr(whole.contact, name))
     assert again.energy_drift == whole.energy_drift
     assert again.contact.touch == whole.contact.touch
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_run_resumes_where_contact_is_compiled_as_it_was(
+    first: bool, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, here = build("paper_forward", [*SMALL, ON, TABLE, *SHORT]), contact_library()
+
+    def have(compiler: bool) -> None:
+        for name in ("obstacles.compiled", "run.contact.step", "run.contact.flat", "obstacles.small"):
+            monkeypatch.setattr(f"softgrasp.fem.{name}.contact_library", lambda: here if compiler else None)
+
+    have(first)
+    with pytest.raises(Paused):
+        simulate(model, RunOptions(mpi_tmp_path, until=101))
+    have(not first)
+    words = "with compiled contact, which this machine lacks" if first else "without compiled contact, which this"
+    with pytest.raises(CheckpointError, match=f"{words}.*resume where the run began, or run again without --resume"):
+        simulate(model, RunOptions(mpi_tmp_path, resume=True))
 
 
 @pytest.mark.ranks(3)
