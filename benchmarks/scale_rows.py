@@ -23,9 +23,9 @@ from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.shell.timing import processor_seconds
 
 STEPS = 200  # of the run whose time is reported
-MOST_TIMED = 40  # steps that are timed
-FIRST = 5  # steps before the timed ones: the guesses of iterative solvers need some
-SECONDS = 3.0  # of the timed steps together [s], about, where 40 would need more
+MOST_TIMED = 40  # steps that are timed with a factor, which are all alike; with iterations all are
+FIRST = 5  # steps before the timed ones
+SECONDS = 3.0  # of these steps together [s], about, where 40 would need more
 NEARLY = "tissue.material={young=69e3, poisson=0.49, rho=1070.0}"  # silicone
 
 
@@ -80,7 +80,7 @@ class Stages:
 
 
 def measure_row(*, kind: str, size: int, solver: str = "auto") -> list[ScaleCost]:
-    """A run of so many unknowns, stage by stage, with as many steps as their time needs. Collective."""
+    """A run of so many unknowns, stage by stage. Collective."""
     comm = MPI.COMM_WORLD
     build(scale_scene(comm, kind, 10), comm=comm)  # compiles the forms
     base = peak_memory_mb(comm)
@@ -93,12 +93,15 @@ def measure_row(*, kind: str, size: int, solver: str = "auto") -> list[ScaleCost
     run = made[1]
     ts = make_ts(run)
     stages.take("equilibrium", run.start)
-    run.advance_to(ts, FIRST)
-    paced = processor_seconds(comm, lambda: run.advance_to(ts, FIRST + 1))
-    count = int(np.clip(SECONDS / max(paced, 1e-6), 2, MOST_TIMED))
-    done = len(run.midpoint.iterations) if isinstance(run.midpoint, InexactMidpoint) else 0
-    stages.take("step", lambda: run.advance_to(ts, FIRST + 1 + count), count)
-    iterations = float(np.mean(run.midpoint.iterations[done:])) if isinstance(run.midpoint, InexactMidpoint) else 0.0
+    iterations = 0.0
+    if isinstance(run.midpoint, InexactMidpoint):  # iterations become fewer along a run, as the last solutions serve
+        stages.take("step", lambda: run.advance_to(ts, STEPS), STEPS)
+        iterations = float(np.mean(run.midpoint.iterations))
+    else:
+        run.advance_to(ts, FIRST)
+        paced = processor_seconds(comm, lambda: run.advance_to(ts, FIRST + 1))
+        count = int(np.clip(SECONDS / max(paced, 1e-6), 2, MOST_TIMED))
+        stages.take("step", lambda: run.advance_to(ts, FIRST + 1 + count), count)
     with tempfile.TemporaryDirectory() as folder:
         writer = SeriesWriter(model, comm.bcast(folder))
         (z, v), q = np.split(run.state.array, 2), np.zeros(layout.n_s)
