@@ -11,6 +11,7 @@ The names below are loaded when they are used first; until then neither MPI nor 
 from __future__ import annotations
 
 import os
+import sys
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
     from softgrasp.study.reduce.linear.table import compare_bases as compare_bases
     from softgrasp.study.runs.sweep import sweep as sweep
 
+if "numpy" in sys.modules and "OPENBLAS_NUM_THREADS" not in os.environ:
+    import_module("softgrasp._threads").one_thread()
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy: ranks share the cores
     os.environ.setdefault(_variable, "1")
 # Before PETSc, whose own handler aborts the program when the reader of its output has gone (`| head`).

@@ -6,6 +6,7 @@ import ast
 import doctest
 import importlib
 import inspect
+import os
 import re
 import subprocess
 import sys
@@ -35,6 +36,20 @@ def test_import_loads_neither_mpi_nor_dolfinx() -> None:
     code = "import sys, softgrasp as sg; dir(sg); sg.Scene; print({'mpi4py.MPI', 'dolfinx'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.stdout.strip() == "set()", done.stderr
+
+
+@pytest.mark.parametrize(("given", "threads"), [(None, 1), ("2", 2)])
+def test_numpy_loaded_before_gets_one_thread_unless_the_user_asks_for_more(given: str | None, threads: int) -> None:
+    """A small model on several threads takes up to six times the processor time; threadpoolctl counts them."""
+    pytest.importorskip("threadpoolctl")
+    if (os.cpu_count() or 1) < threads:
+        pytest.skip("one core")
+    code = "import numpy, scipy.linalg, softgrasp as sg; from threadpoolctl import threadpool_info as info\n"
+    code += "print(*(pool['num_threads'] for pool in info() if pool['internal_api'] == 'openblas'))"
+    own = {key: value for key, value in os.environ.items() if key not in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+    own |= {} if given is None else {"OPENBLAS_NUM_THREADS": given}
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=own, capture_output=True, text=True)
+    assert set(done.stdout.split()) == {str(threads)}, done.stderr
 
 
 def test_a_script_beside_the_checkout_imports_the_package(tmp_path: Path) -> None:

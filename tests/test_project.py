@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -282,6 +283,8 @@ def test_wheel_is_one_package_and_does_not_ask_for_a_solver(wheel: Path) -> None
     assert modules | scenes | {"softgrasp/__init__.py", "softgrasp/py.typed"} <= names
     needed = re.findall(r"^Requires-Dist: ([\w.-]+)[^;\n]*$", metadata, re.MULTILINE)
     assert "numpy" in needed
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
+    assert re.findall(r"^Project-URL: (.+), (\S+)$", metadata, re.MULTILINE) == list(urls.items())
     assert not {"dolfinx-solver-real", "mpich", "fenics-dolfinx", "petsc4py"} & set(needed)
 
 

@@ -43,6 +43,7 @@ def objects() -> dict[str, Any]:
         "replay": sg.replay(rom, model, run), "design": design, "controller": controller,
         "margins": loop_margins(controller), "problem": design.problem, "solution": design.solution, "loop": loop,
         "table": table, "strained_run": strained_run, "strain_model": strain_model,
+        "abscissa": sg.abscissa(design.problem, design.gain),
         "strain_replay": sg.replay(strain_model, strained, strained_run),
     }  # fmt: skip
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from softgrasp.fem.columns import AXES
 from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.shown import Shown
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem
@@ -28,8 +29,8 @@ class Noise:
     force: float | None = None  # of the force on the hand [N, N m]
 
 
-@dataclass(frozen=True)
-class Sensors:
+@dataclass(frozen=True, repr=False)
+class Sensors(Shown):
     """Samples of every tick, those of the hand first."""
 
     C: Block  # samples of the state, transposed, hand (2 n_s, p), local rows (2 n_local, p)

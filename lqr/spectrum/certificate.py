@@ -11,6 +11,7 @@ from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc, from_options, total
+from softgrasp.fem.shown import Shown
 from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
 from softgrasp.fem.solve.stiffness import shared_factor
 from softgrasp.fem.system import dynamic_stiffness
@@ -35,8 +36,8 @@ GAP = 1e-3  # relative distance of two eigenvalues that the circle may pass betw
 NEARLY = 1e-3  # share of the abscissa by which an eigenvalue outside may exceed it
 
 
-@dataclass(frozen=True)
-class Abscissa:
+@dataclass(frozen=True, repr=False)
+class Abscissa(Shown):
     """Largest real part of the closed-loop spectrum."""
 
     value: float

@@ -66,8 +66,8 @@ class OfflineMeshEstimate:
         return max(self.estimates)
 
 
-@dataclass(frozen=True)
-class Certificate:
+@dataclass(frozen=True, repr=False)
+class Certificate(Shown):
     """Errors of one reduced run, separated by their sources: reduction, time step, mesh.
 
     Attributes:
@@ -144,15 +144,22 @@ class Certificate:
             result.append(f"The {key} leaves the larger error: a finer basis gains nothing.")
         return tuple(result)
 
+    def card(self) -> Card:
+        """The three errors with how they are known, and whether the materials lie in the box of the training."""
+        return Card("Certificate", (*self._parts(), ("in the box", "yes" if self.inside else "no")))
+
     def sentence(self) -> str:
         """The three numbers in one line."""
+        return " | ".join(f"{name} {value}" for name, value in self._parts())
+
+    def _parts(self) -> tuple[tuple[str, str], ...]:
         step = "not known" if self.time_step is None else f"{percent(self.time_step)} (estimate)"
         mesh = "not known"
         if self.mesh is not None:
             count = len(self.mesh.places)
             where = f"largest of {count} trained materials" if count > 1 else "at one trained material"
             mesh = f"{percent(self.mesh.largest)} (estimate, {where})"
-        return f"reduction {percent(self.reduction)} ({self.how}) | time step {step} | mesh {mesh}"
+        return ("reduction", f"{percent(self.reduction)} ({self.how})"), ("time step", step), ("mesh", mesh)
 
 
 @dataclass(frozen=True, repr=False)

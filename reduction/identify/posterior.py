@@ -11,6 +11,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SceneError, SoftgraspError
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import Shown
 from softgrasp.reduction.identify.fit import ROBUST, Misfit
 
 FEWEST = 1000  # samples
@@ -21,8 +22,8 @@ SEED = 0
 MISSING = "--posterior needs the package emcee; pip install 'softgrasp[posterior]', or leave it out"
 
 
-@dataclass(frozen=True)
-class Posterior:
+@dataclass(frozen=True, repr=False)
+class Posterior(Shown):
     """What samples say of the logarithms of the values."""
 
     mean: Array  # mean of log theta less the answer's, (k,) [1]

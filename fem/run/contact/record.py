@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.shown import Shown
 
 
-@dataclass(frozen=True)
-class ContactRecord:
+@dataclass(frozen=True, repr=False)
+class ContactRecord(Shown):
     """Forces, gaps and energies of contact in a run; arrays are the same on every rank."""
 
     names: tuple[str, ...]
