@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from importlib import import_module
@@ -11,6 +12,10 @@ from typing import Any
 
 import numpy as np
 
+UNITS = (
+    r"%|1/s|[mµu]?s|[mµ]?m|k?m/s2?|kg(?:/m3)?|[mk]?N(?:/m| m| s)?|Nm|[mk]?J|[kM]?Pa|k?Hz|rad(?:/s)?|deg|[kMG]i?B|min|h"
+)
+BEFORE_UNIT = re.compile(rf"(?<=\d) (?=(?:{UNITS})(?![\w/]))")  # a space at which no line may end
 MOST_LAYERS = 3  # materials that are shown one by one
 
 
@@ -30,7 +35,7 @@ class Card:
         """A small table with its title above."""
         cells = "".join(
             f'<tr><th style="text-align:left">{html.escape(name)}</th>'
-            f'<td style="text-align:left">{html.escape(value)}</td></tr>'
+            f'<td style="text-align:left">{html.escape(unbroken(value))}</td></tr>'
             for name, value in self.rows
         )
         return f"<div><strong>{html.escape(self.title)}</strong><table>{cells}</table></div>"
@@ -105,3 +110,8 @@ def percent(share: float, sign: str = "") -> str:
     if not abs(share) < 100:
         return "< -9999 %" if share < 0 else "> 9999 %"
     return f"{100 * share:{sign}{'.2g' if abs(share) < 0.995 else '.0f'}} %"
+
+
+def unbroken(text: str) -> str:
+    """The text with no-break spaces between numbers and units, so that no line begins with "%"."""
+    return BEFORE_UNIT.sub("\u00a0", text)

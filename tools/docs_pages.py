@@ -18,6 +18,7 @@ from mkdocs.structure.pages import Page
 
 import softgrasp
 from softgrasp.fem.scene.scene import scene_schema
+from softgrasp.fem.shown import unbroken
 
 ROOT = Path(__file__).parents[1]
 DEMOS = sorted((ROOT / "demos").glob("demo_*.py"))
@@ -89,7 +90,7 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
 
 
 def on_page_content(html: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """No line ends inside 5.5e-13 or --set in a table."""
+    """No line ends inside 5.5e-13 or --set in a table, or between a number and its unit."""
 
     def cell(found: re.Match[str]) -> str:
         start, inside, end = found.groups()
@@ -97,7 +98,9 @@ def on_page_content(html: str, *, page: Page, config: MkDocsConfig, files: Files
         whole = r'<span class="whole">\g<0></span>'
         return start + re.sub(r"(?s)^.+$" if short else r"(?<=[ >])--?[a-z][\w-]*", whole, inside) + end
 
-    return re.sub(r"(?s)(<td[^>]*>)(.*?)(</td>)", cell, html)
+    html = re.sub(r"(?s)(<td[^>]*>)(.*?)(</td>)", cell, html)
+    parts = re.split(r"(?s)(<(?:pre|code|script|style)\b.*?</(?:pre|code|script|style)>|<[^>]*>)", html)
+    return "".join(part if i % 2 else unbroken(part) for i, part in enumerate(parts))
 
 
 def python_names() -> str:

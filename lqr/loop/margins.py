@@ -26,8 +26,8 @@ POINTS = 4000  # frequencies, spaced evenly in log w: 0.3 % apart over five deca
 NEAR = 60  # more around each resonance, where the phase turns at once
 
 
-@dataclass(frozen=True)
-class AxisMargins:
+@dataclass(frozen=True, repr=False)
+class AxisMargins(Shown):
     """Margins of the loop seen at one input; nan where it has no such crossing."""
 
     name: str  # label of the input, with unit

@@ -149,17 +149,16 @@ class Answers:
         closest = None
         if full is not None:
             words.append(
-                f"The cheapest full run within {percent(tolerance)} is {full.point.label}: {_prediction(full)}, "
-                f"measured {percent(full.point.error)} of the deformation ({percent(full.point.error_displacement)} of "
-                "the displacement) "
-                f"in {seconds_text(full.point.seconds)}."
+                f"The cheapest full run within {percent(tolerance)} is {full.point.label}: by its own measured error, "
+                f"{percent(full.point.error)} of the deformation ({percent(full.point.error_displacement)} of the "
+                f"displacement), in {seconds_text(full.point.seconds)}; {_prediction(full)}."
             )
         if reduced is not None and isinstance(reduced.point, ReducedPoint):
             point = reduced.point
             words.append(
-                f"The fastest model for many runs is {point.label}: {_prediction(reduced)} a run, measured "
-                f"{percent(point.error)} in {seconds_text(point.seconds)}; from nothing, with the full run behind it, "
-                f"{seconds_text(point.scratch)}."
+                f"The fastest model for many runs is {point.label}: measured {percent(point.error)} in "
+                f"{seconds_text(point.seconds)} a run; {_prediction(reduced)}. From nothing, with the full run behind "
+                f"it, it takes {seconds_text(point.scratch)}."
             )
         if full is None and reduced is None:
             closest, more = self._missed(tolerance)
@@ -272,7 +271,7 @@ def _two_bases(points: Sequence[ReducedPoint], attribute: str) -> list[ReducedPo
 
 def _prediction(choice: Choice) -> str:
     error, seconds = choice.predicted or (0.0, 0.0)
-    return f"predicted error {percent(error)} in {seconds_text(seconds)}"
+    return f"before the run, {percent(error)} in {seconds_text(seconds)} was predicted"
 
 
 def _step_words(point: RunPoint) -> str:

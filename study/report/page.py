@@ -14,6 +14,7 @@ from markupsafe import Markup
 from PIL import Image
 
 from softgrasp.fem import Scene, note, resolved_toml
+from softgrasp.fem.shown import unbroken
 from softgrasp.study.report.document import NUMBERS, Page, Section, cell_text, in_words
 from softgrasp.study.report.equation import equation
 from softgrasp.study.report.origin import made_with
@@ -99,9 +100,12 @@ def write_report(
         given.insert(1, of_scene(scene))
     if page.command:
         given.append(Section("Made with", rows=made_with(result)))
-    template = Environment(autoescape=True, trim_blocks=True, undefined=StrictUndefined).from_string(
-        TEMPLATE.read_text(encoding="utf-8")
-    )
+    template = Environment(
+        autoescape=True,
+        trim_blocks=True,
+        undefined=StrictUndefined,
+        finalize=lambda value: unbroken(value) if type(value) is str else value,
+    ).from_string(TEMPLATE.read_text(encoding="utf-8"))
     prepared, warnings = [_prepared(section) for section in given], list(dict.fromkeys([*notes, *page.warnings]))
     parts = (part for s in prepared for part in (s["title"], *s["paragraphs"], *s["details"], *s["header"]))
     text = " ".join((*page.errors, *warnings, *page.summary, *parts))

@@ -87,6 +87,18 @@ def test_a_page_that_loads_something_is_seen(mark: str) -> None:
     assert outside(f"<p>before</p>{mark}")
 
 
+def test_no_line_ends_between_a_number_and_its_unit_but_commands_stay_as_they_are_typed(tmp_path: Path) -> None:
+    parts = [
+        Section("T", text="It is 0.52 % or 3 m/s in 3 steps.", code="sleep 3 s"),
+        Section("", rows=[("a", "2 Pa")]),
+    ]
+    html = write_report(tmp_path / "report.html", Page("t", (), parts, command="run 5 m")).read_text()
+    assert "0.52\u00a0% or 3\u00a0m/s in 3 steps" in html
+    assert "2\u00a0Pa" in html
+    assert "sleep 3 s" in html
+    assert "run 5 m" in html
+
+
 def test_text_about_addresses_is_no_address(tmp_path: Path) -> None:
     assert outside('<p>src=a.png href="x" url(a) @import</p><img src="data:image/png;base64,AA">') == []
     path = write_report(tmp_path / "r.html", Page("t", (), [Section("", "<script src='a.js'></script>")]))
