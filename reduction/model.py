@@ -124,6 +124,19 @@ class ReducedModel(Shown):
         """
         return drawn("explorer", self, model, run, span)
 
+    def pull(self, model: Model) -> Any:
+        """A page in which the mouse pulls the hand and this model of the tissue follows, for a notebook. Collective.
+
+        Args:
+            model: scene of the model, with the materials of the motion.
+
+        Returns:
+            :class:`softgrasp.study.notebook.View`: ``save("pull.html")`` writes it; empty on a rank above 0.
+
+        Raises ModelError: the basis does not keep the hand apart, or the model is unstable or without its basis.
+        """
+        return drawn("pulled", self, model)
+
     def to_pymor(self) -> Any:
         """The model as ``pymor.models.iosys.LTIModel``, affine in ``mu``, ``lambda`` [Pa], ``beta`` [s] of each layer.
 

@@ -29,6 +29,7 @@ from softgrasp.study.pictures import MOST_FRAMES, histories, move_bytes
 from softgrasp.study.pictures.style import CYCLE, FULL, WIDTH, length_unit, log_axis, paper_style
 from softgrasp.study.pictures.traces import traces
 from softgrasp.study.pictures.turning import Scene3D
+from softgrasp.study.pull.page import pull_page
 from softgrasp.study.reduce.linear.plots import QUANTITIES, errors_figure
 from softgrasp.study.reduce.linear.result import MethodSweep
 
@@ -210,6 +211,11 @@ def view3d(run: Trajectory | LoopTrajectory, model: Model) -> View:
             (0.0, factor * float(sizes.max())), flat=flat,
         ).html()
     )  # fmt: skip
+
+
+def pulled(rom: ReducedModel, model: Model) -> View:
+    """The hand to pull with the mouse. Collective; rank 0 draws, the others get an empty page."""
+    return View(pull_page(rom, model))
 
 
 def animation(run: Trajectory | LoopTrajectory, model: Model) -> Film:

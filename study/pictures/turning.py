@@ -12,13 +12,13 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from softgrasp.fem import Array
 from softgrasp.study.pictures import shapes
 
-TEMPLATE = Path(__file__).with_name("turning.html")
+TEMPLATES = [Path(__file__).parent, Path(__file__).parents[1] / "pull"]  # one draws, the other also steps a model
 MOST_BYTES = 12_000_000  # of all coordinates in the page; above, instants are left out
 LEVELS = 65535  # steps of a coordinate over the largest side of the scene
 
@@ -49,11 +49,11 @@ class Scene3D:
         around = [self.obstacles[i] for i in kept] if len(self.obstacles) > 1 else self.obstacles
         times = [float(self.times[i]) for i in kept]
         data = {
-            "triangles": _text(self.triangles.astype("<u4")),
-            "points": _text(np.round((points - low) / step).astype("<u2")),
-            "values": _text(np.round(255 * np.clip(sizes, 0.0, 1.0)).astype(np.uint8)),
-            "colours": _text(np.round(255 * mpl.colormaps["viridis"](np.linspace(0, 1, 256))[:, :3]).astype(np.uint8)),
-            "obstacles": [_text(x.astype("<f4")) for x in around],
+            "triangles": as_text(self.triangles.astype("<u4")),
+            "points": as_text(np.round((points - low) / step).astype("<u2")),
+            "values": as_text(np.round(255 * np.clip(sizes, 0.0, 1.0)).astype(np.uint8)),
+            "colours": as_text(colours()),
+            "obstacles": [as_text(x.astype("<f4")) for x in around],
             "stride": values.shape[1], "by_cell": values.shape[1] == len(self.triangles) != points.shape[1],
             "low": low.tolist(), "step": step, "middle": ((low + high) / 2).tolist(),
             "radius": 0.55 * float(np.linalg.norm(high - low)),
@@ -63,13 +63,24 @@ class Scene3D:
             "times": times, "labels": [self.labels[i].replace("\n", " ") for i in kept],
             "slower": 1 / shapes.speed_up(np.array(times)) if times[-1] > times[0] else 1.0,
         }  # fmt: skip
-        page = Environment(autoescape=True, trim_blocks=True, undefined=StrictUndefined).from_string(
-            TEMPLATE.read_text(encoding="utf-8")
-        )
-        text = json.dumps(data).replace("<", "\\u003c")  # no tag within the script
         low_end, high_end = (f"{x:.3g}" for x in self.ends)
-        return page.render(title=self.title, data=Markup(text), low=low_end, high=high_end)
+        return rendered("turning.html", data, title=self.title, low=low_end, high=high_end)
 
 
-def _text(array: npt.NDArray[Any]) -> str:
+def rendered(template: str, data: dict[str, Any], **words: Any) -> str:
+    """A page of :data:`TEMPLATES` with its data."""
+    pages = Environment(
+        loader=FileSystemLoader(TEMPLATES), autoescape=True, trim_blocks=True, undefined=StrictUndefined
+    )
+    text = json.dumps(data).replace("<", "\\u003c")  # no tag within the script
+    return pages.get_template(template).render(data=Markup(text), **words)
+
+
+def colours() -> npt.NDArray[np.uint8]:
+    """The 256 colours of a field, (256, 3)."""
+    return np.asarray(np.round(255 * mpl.colormaps["viridis"](np.linspace(0, 1, 256))[:, :3]).astype(np.uint8))
+
+
+def as_text(array: npt.NDArray[Any]) -> str:
+    """Its bytes in base64."""
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()

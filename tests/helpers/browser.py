@@ -34,13 +34,14 @@ def find_chromium() -> str | None:
 class Browser:
     """One Chromium with one page. Messages are JSON ended by a zero byte, to its descriptor 3 and from its 4."""
 
-    def __init__(self, program: str) -> None:
+    def __init__(self, program: str, *options: str) -> None:
         self.home = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         to_read, self.to = os.pipe()
         self.back, from_write = os.pipe()
         # sh moves the pipes to the descriptors that Chromium expects, from any number that they have here
         script = f'exec "$@" 3<&{to_read} 4>&{from_write}'
-        command = [program, *ONE_PROCESS, f"--user-data-dir={self.home.name}", "--remote-debugging-pipe", "about:blank"]
+        own = (f"--user-data-dir={self.home.name}", "--remote-debugging-pipe", "about:blank")
+        command = [program, *ONE_PROCESS, *options, *own]
         self.process = subprocess.Popen(
             ["bash", "-c", script, "bash", *command],
             pass_fds=(to_read, from_write),

@@ -46,11 +46,12 @@ CAPTIONS = {
     "compare.png": "Reduced bodies under the outline of the full one, at instants of large deformation or error.",
     "compare.gif": "The same in motion.",
 }
+PULL = "In pull.html, listed below, the mouse pulls the hand and a reduced model of the tissue follows."
 HOW = "Each method is built from the snapshots of one run and repeats it, driven by the same hand."
 
 
-def compose(study: ReductionStudy, drawn: Sequence[Path], models: Sequence[Path]) -> Page:
-    """The page; ``drawn``: pictures, ``models``: files of the reduced models."""
+def compose(study: ReductionStudy, drawn: Sequence[Path], models: Sequence[Path], pulled: Path | None = None) -> Page:
+    """The page; ``drawn``: pictures, ``models``: files of the reduced models, ``pulled``: the page with the mouse."""
     scene, sweeps, figures = study.full.model.scene, study.sweeps, captioned(drawn, CAPTIONS)
     energy, refused = scene.reduction.energy, refused_table(sweeps)
     notes = (N_NOTE, error_note(energy), inner_note(sweeps))
@@ -61,9 +62,11 @@ def compose(study: ReductionStudy, drawn: Sequence[Path], models: Sequence[Path]
         time_table(study).section(details="\n\n".join(study.speed_notes), terminal=True),
         *([refused.section(terminal=True)] if refused.rows else []),
         *box_sections(study.box, scene.effects.damping is not None),
-        Section("Pictures", figures=[(file, text) for file, text in figures if file.name not in FIRST]),
+        Section(
+            "Pictures", PULL if pulled else "", figures=[(file, t) for file, t in figures if file.name not in FIRST]
+        ),
     ]
-    tables, files = {"points.csv": point_table(study)}, [*drawn, *models]
+    tables, files = {"points.csv": point_table(study)}, [*drawn, *models, *([pulled] if pulled else [])]
     return Page(f"{scene.name}: reduced models", summary(study), parts, tables, files, errors=headline(study))
 
 

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from softgrasp.fem import Scene, Stopwatch
+from softgrasp.fem import Scene, Stopwatch, note
+from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.reduction import FullRun
 from softgrasp.reduction.archive import save
+from softgrasp.reduction.system import ModelError
 from softgrasp.study.pictures import draw_in_background
+from softgrasp.study.pull.page import pull_page
 from softgrasp.study.reduce.linear import measure
 from softgrasp.study.reduce.linear.page import compose, findings
-from softgrasp.study.reduce.linear.result import MethodSweep, ReductionStudy, best
+from softgrasp.study.reduce.linear.result import MethodSweep, ReductionStudy, best, by_error
 from softgrasp.study.reduce.linear.views import gather_views
 from softgrasp.study.reduce.times import FullTimes, measured_run
 from softgrasp.study.shell import Session
@@ -39,10 +43,32 @@ def run_linear(session: Session, scene: Scene, names: Sequence[str]) -> dict[str
     with watch.stage("models"):
         for file, (s, p) in zip(models, chosen, strict=True):
             save(s.models[p.N], file)
+    pulled = write_pull(session, study)
     result = study.result(watch.seconds)
 
-    session.write(scene, result, lambda: compose(study, drawn(), models))
+    session.write(scene, result, lambda: compose(study, drawn(), models, pulled))
     return result
+
+
+def write_pull(session: Session, study: ReductionStudy) -> Path | None:
+    """Write the page in which the mouse pulls the most accurate model that keeps the hand apart; None: there is none.
+
+    Collective; all ranks get the name.
+    """
+    apart = [(s, p) for s, p in by_error(study.sweeps) if s.models[p.N].fixed_solid]
+    if not (session.pictures and apart):
+        return None
+    (s, p), file = apart[0], session.out / "pull.html"
+    page = ""
+    with suppress(ModelError):  # larger than a page may be, or without a single equilibrium
+        page = pull_page(s.models[p.N], study.full.model)
+    if not session.comm.bcast(page != ""):
+        return None
+    with raise_on_all_ranks(session.comm):
+        if page:
+            note(file)
+            file.write_text(page, encoding="utf-8")
+    return file
 
 
 def begin_to_draw(
