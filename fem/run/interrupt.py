@@ -25,7 +25,7 @@ def interruptible(speaks: bool = False) -> Iterator[list[bool]]:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         if speaks:
             with suppress(OSError):  # nobody listens; print may not be called while another print is under way
-                os.write(2, b"\nstopping as soon as the restart file is written; Ctrl-C again stops at once\n")
+                os.write(2, b"\nstopping as soon as the restart file is written; a second signal stops at once\n")
 
     try:
         previous = {number: signal.signal(number, stop) for number in SIGNALS}

@@ -18,7 +18,7 @@ from markupsafe import Markup
 from softgrasp.fem import Array
 from softgrasp.study.pictures import shapes
 
-TEMPLATES = [Path(__file__).parent, Path(__file__).parents[1] / "pull"]  # one draws, the other also steps a model
+TEMPLATE = Path(__file__).with_name("turning.html")
 MOST_BYTES = 12_000_000  # of all coordinates in the page; above, instants are left out
 LEVELS = 65535  # steps of a coordinate over the largest side of the scene
 
@@ -64,16 +64,17 @@ class Scene3D:
             "slower": 1 / shapes.speed_up(np.array(times)) if times[-1] > times[0] else 1.0,
         }  # fmt: skip
         low_end, high_end = (f"{x:.3g}" for x in self.ends)
-        return rendered("turning.html", data, title=self.title, low=low_end, high=high_end)
+        return rendered(TEMPLATE, data, title=self.title, low=low_end, high=high_end)
 
 
-def rendered(template: str, data: dict[str, Any], **words: Any) -> str:
-    """A page of :data:`TEMPLATES` with its data."""
+def rendered(template: Path, data: dict[str, Any], **words: Any) -> str:
+    """A page with its data, by :data:`TEMPLATE` or by a template that extends it."""
     pages = Environment(
-        loader=FileSystemLoader(TEMPLATES), autoescape=True, trim_blocks=True, undefined=StrictUndefined
-    )
+        loader=FileSystemLoader([template.parent, TEMPLATE.parent]),
+        autoescape=True, trim_blocks=True, undefined=StrictUndefined,
+    )  # fmt: skip
     text = json.dumps(data).replace("<", "\\u003c")  # no tag within the script
-    return pages.get_template(template).render(data=Markup(text), **words)
+    return pages.get_template(template.name).render(data=Markup(text), **words)
 
 
 def colours() -> npt.NDArray[np.uint8]:

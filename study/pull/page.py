@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from softgrasp.fem import Array, Model, PictureMesh
@@ -15,6 +17,7 @@ from softgrasp.reduction.system import ModelError
 from softgrasp.study.pictures import shapes
 from softgrasp.study.pictures.turning import as_text, colours, rendered
 
+TEMPLATE = Path(__file__).with_name("pull.html")
 MOST_BYTES = 20_000_000  # of the shapes in the page
 FOLLOWS = 25.0  # rate at which the hand follows the mouse, per second of the clock [1/s]
 FRAME = 1 / 60  # between two pictures [s]
@@ -86,4 +89,4 @@ def _page(rom: ReducedModel, picture: PictureMesh, step: Propagator, start: Arra
     }  # fmt: skip
     name = METHODS[rom.name].title if rom.name in METHODS else rom.name  # a basis of the user's own
     title = f"{name}, N = {rom.N}: displacement relative to the hand [{unit}]"
-    return rendered("pull.html", data, title=title, low="0", high="0", space=not flat)
+    return rendered(TEMPLATE, data, title=title, low="0", high="0", space=not flat)
