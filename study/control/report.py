@@ -201,13 +201,15 @@ def summary(study: GainStudy) -> list[str]:
     if isinstance(study, ControlStudy):
         full = study.loops.full
         arrived, paid = settled(full.times, study.distance(full)), full.cost[-1]
-        reaches = "does not settle within 1 % of the way in this run" if arrived is None else (
+        reaches = "does not settle within 1 % of the way in this run, see the notes" if arrived is None else (
             f"reaches the target, within 1 % of the way, in {arrived:.3g} s"
         )  # fmt: skip
         free = "" if study.planned is None else " without obstacles and limits"
         free = free if study.loops.touching is None else " without obstacles"
         outcome = [f"The optimal gain{free} {reaches}."]
-        cost = f"The move{free} costs {paid:.4g}; the Riccati equation predicts {optimal:.4g}."
+        rest = study.loops.to_come
+        later = f", and {rest:.3g} after the run" if rest > 1e-3 * paid else ""
+        cost = f"The move{free} costs {paid:.4g}{later}; the Riccati equation predicts {optimal:.4g} in all."
         if full.saturated:
             excess = (paid + study.loops.to_come) / optimal - 1
             cost = f"With the limits of the loads the move costs {percent(excess)} more than without them."

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from PIL import Image
 
 from softgrasp.fem import Scene, note, resolved_toml
@@ -100,12 +100,14 @@ def write_report(
         given.insert(1, of_scene(scene))
     if page.command:
         given.append(Section("Made with", rows=made_with(result)))
-    template = Environment(
+    environment = Environment(
         autoescape=True,
         trim_blocks=True,
         undefined=StrictUndefined,
         finalize=lambda value: unbroken(value) if type(value) is str else value,
-    ).from_string(TEMPLATE.read_text(encoding="utf-8"))
+    )
+    environment.filters["words"] = words
+    template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
     prepared, warnings = [_prepared(section) for section in given], list(dict.fromkeys([*notes, *page.warnings]))
     parts = (part for s in prepared for part in (s["title"], *s["paragraphs"], *s["details"], *s["header"]))
     text = " ".join((*page.errors, *warnings, *page.summary, *parts))
@@ -151,6 +153,11 @@ def _prepared(section: Section) -> dict[str, Any]:
         "kind": "wider" if section.header else "pairs",
         "figures": figures,
     }
+
+
+def words(text: str) -> Markup:
+    """A sentence as the page shows it: `names` in the type of code."""
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(unbroken(text)))))
 
 
 def paragraphs(text: str) -> list[str]:
