@@ -15,7 +15,8 @@ import numpy as np
 UNITS = (
     r"%|1/s|[mµu]?s|[mµ]?m|k?m/s2?|kg(?:/m3)?|[mk]?N(?:/m| m| s)?|Nm|[mk]?J|[kM]?Pa|k?Hz|rad(?:/s)?|deg|[kMG]i?B|min|h"
 )
-BEFORE_UNIT = re.compile(rf"(?<=\d) (?=(?:{UNITS})(?![\w/]))")  # a space at which no line may end
+# spaces at which no line may end: "2 %", "N = 14"
+TIED = re.compile(rf"(?<=\d) (?=(?:{UNITS})(?![\w/]))|(?<=\bN) (?== )|(?<=\bN =) ")
 MOST_LAYERS = 3  # materials that are shown one by one
 
 
@@ -113,5 +114,5 @@ def percent(share: float, sign: str = "") -> str:
 
 
 def unbroken(text: str) -> str:
-    """The text with no-break spaces between numbers and units, so that no line begins with "%"."""
-    return BEFORE_UNIT.sub("\u00a0", text)
+    """The text with no-break spaces between numbers and units, so that no line begins with "%", and in "N = 14"."""
+    return TIED.sub("\u00a0", text)

@@ -79,7 +79,8 @@ def _page(rom: ReducedModel, picture: PictureMesh, step: Propagator, start: Arra
     data = {
         "triangles": as_text(triangles.reshape(-1, 3).astype("<u4")), "colours": as_text(colours()), "obstacles": [],
         "step": as_text(step.matrix.astype("<f8")), "shapes": as_text(U.astype("<f4")),
-        "rest": as_text(points.astype("<f4")), "start": start.tolist(), "dimension": d, "hand": picture.n_s,
+        "held": as_text(np.isin(used, picture.contact).astype(np.uint8)), "rest": as_text(points.astype("<f4")),
+        "start": start.tolist(), "dimension": d, "hand": picture.n_s,
         "dt": step.dt, "slower": slower, "rate": FOLLOWS * slower, "factor": factor,
         "place_factor": place_factor, "unit": place_unit,
         "wide": WIDE * float(np.ptp(points, axis=0).max()), "middle": middle.tolist(),
