@@ -25,7 +25,8 @@ MOST_FRAMES = 60
 TICKS = 2  # shortest time of a frame [1/100 s]; viewers slow down what is shorter
 MOST_BYTES = 3_000_000
 DPI = 110
-SMALL = 0.6  # share of the picture that a body in 3D fills at least; else the picture goes with it
+SMALL = 0.6  # least size of a body in 3D over that in a picture of the body alone; else the picture goes with it
+ROOM = (5.4, 4.2)  # width and largest height of a picture [in]
 REST = 1.0  # [s] the last frame stays longer
 
 
@@ -82,7 +83,7 @@ def render(move: body.MoveView, frames: Array, times: Array) -> list[Any]:
     digits = int(np.clip(2 - np.floor(np.log10(times[-1] or 1.0)), 0, 6))
     note = f" ({fast:g}×)" if fast != 1 else ""
     with paper_style():
-        figure, axes = body.make_axes(move, 1, captions=False, width=5.4, tallest=4.2)
+        figure, axes = body.make_axes(move, 1, captions=False, width=ROOM[0], tallest=ROOM[1])
 
         # The longest text first, so that all frames have the size of the first.
         def caption(k: int) -> str:
@@ -111,8 +112,8 @@ def followed(move: body.MoveView, frames: Array) -> list[tuple[Array, Array]]:
     if move.picture.dimension == 2:
         return []
     around = around_bodies(move.picture, frames, move.hands)
-    low, high = around[0]
-    return around if ((high - low) / (move.high - move.low)).max() < SMALL else []
+    alone, whole = (float(np.min(ROOM / (high - low))) for low, high in (around[0], (move.low, move.high)))
+    return around if whole < SMALL * alone else []
 
 
 def film(
