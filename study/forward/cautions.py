@@ -130,7 +130,8 @@ def out_of_reach(model: Model, strain: float, length: float) -> list[str]:
         return []
     return [
         f"On the path of the hand the undeformed body stays {gap:.2g} m from every obstacle, and its deformation is "
-        f"estimated at {margin:.2g} m at most: nothing should touch; set effects.obstacles = false."
+        f"estimated at {margin:.2g} m at most: nothing should touch; set effects.obstacles = false and drop "
+        "[[obstacle]]."
     ]
 
 

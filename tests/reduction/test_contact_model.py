@@ -57,7 +57,7 @@ def test_thirty_columns_repeat_a_motion_they_were_not_made_for() -> None:
 @pytest.mark.serial
 def test_hats_over_nodes_keep_the_dimension_on_a_fine_mesh() -> None:
     fine = "tissue.cells=[60, 120]"
-    rom = contact_model(landing(MADE, *LONG, fine), rows=16)
+    rom = contact_model(landing(MADE, *LONG, fine), 14, rows=14)
     model = landing(OTHER, *LONG, fine)
     begin = time.process_time()
     full = simulate(model)
@@ -68,8 +68,8 @@ def test_hats_over_nodes_keep_the_dimension_on_a_fine_mesh() -> None:
     z, force = errors(full, run, rom.V, MPI.COMM_SELF)
     assert rom.N <= 30
     assert len(rom.kept) == 61  # those of the face, without the sides
-    assert z < 1e-3  # asked for; measured 9.7e-4
-    assert force < 1e-2  # asked for; measured 6.2e-3
+    assert z < 1e-3  # asked for; measured 6.6e-4
+    assert force < 1e-2  # asked for; measured 3.8e-3
     assert spent > 10  # asked for; of the whole run, whose setup is a small part
     # between hat functions nodes sink in, by a part of the deformation of 0.1 m
     assert -1e-3 < run.gap.min() < 0

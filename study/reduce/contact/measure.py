@@ -18,10 +18,10 @@ from softgrasp.reduction.parameters import moved_to
 from softgrasp.study.reduce.times import FullTimes, Say
 from softgrasp.study.shell import median_processor_seconds
 
-MODES = (20, 10, 5)  # clamped modes beside the responses unless the scene names N
-HATS = 16  # rows of hat functions along a half-space then
+MODES = (20, 14, 5)  # clamped modes beside the responses unless the scene names N
+HATS = 14  # rows of hat functions along a half-space then
 LEAST = 4  # modes for which a given N must have room beside rows of all nodes
-SHARE = 0.6  # of a given N without the hand's columns that rows of hat functions take
+SHARE = 0.5  # of a given N without the hand's columns that rows of hat functions take
 RUNS = 9  # behind each median of the time of a run
 DEEP, DEEPER = 1.05, 1.15  # ways of held-out motions towards the first obstacle, over that of the scene
 ASIDE = 0.5  # way along it over that towards it, where the motion of the scene has none
