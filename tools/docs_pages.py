@@ -103,6 +103,11 @@ def on_page_content(html: str, *, page: Page, config: MkDocsConfig, files: Files
     return "".join(part if i % 2 else unbroken(part) for i, part in enumerate(parts))
 
 
+def on_post_build(config: MkDocsConfig) -> None:
+    """Without its own 404.html, whose links are absolute and so right for a site at the root of a server only."""
+    (Path(config.site_dir) / "404.html").unlink(missing_ok=True)
+
+
 def python_names() -> str:
     """What `import softgrasp` gives, in the order of the rooms, and some classes that it returns."""
     text = [
