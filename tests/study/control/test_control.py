@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import html
 import io
 import json
 import re
@@ -32,6 +31,7 @@ from softgrasp.study.control.run import run_control, unused_rate
 from softgrasp.study.report.files import to_json
 from tests.helpers.browser import look
 from tests.helpers.models import make_scene
+from tests.helpers.pages import words_of
 
 SCENES = Path(__file__).parents[3] / "demos" / "scenes"
 SMALL = ["tissue.cells=[4,8]", "control.N=[4,8,12]", "output.fields='none'", "reduction.lambda_range=[50.0,50.0]"]
@@ -84,7 +84,7 @@ def test_result_holds_what_design_names(result: dict[str, Any], out: Path) -> No
 
 
 def test_page_and_terminal_have_the_same_tables(result: dict[str, Any], out: Path) -> None:
-    text, page = MPI.COMM_WORLD.bcast(ran(out, "newton-adi")[1]), (out / "report.html").read_text()
+    text, page = MPI.COMM_WORLD.bcast(ran(out, "newton-adi")[1]), words_of(out / "report.html")
     best = [
         min((p for p in points if p["stable"]), key=lambda p: p["cost_excess"]) for points in result["reduced"].values()
     ]
@@ -106,7 +106,7 @@ def test_the_gain_alone_has_its_notes_on_page_and_terminal(tmp_path: Path) -> No
     found = run_control(scene, tmp_path / "out", ["tissue.cells=[2,4]"], console, quiet=True, gain_only=True)
     assert "no [control] table" in found["notes"][0]
     assert found["notes"][0] in text.getvalue()
-    assert found["notes"][0] in html.unescape((tmp_path / "out" / "report.html").read_text())
+    assert found["notes"][0] in words_of(tmp_path / "out" / "report.html")
 
 
 @pytest.mark.ranks(2)
@@ -367,7 +367,7 @@ def test_galerkin_states_its_true_residual_and_the_part_of_the_tissue(tmp_path: 
     assert 0 < hand < 1e-2 * tissue < 1e-5
     assert f"{found['residual']:.1e}" in text.getvalue()
     assert f"rows of the hand {percent(hand)}, of the tissue {percent(tissue)}" in text.getvalue()
-    page = (out / "report.html").read_text()
+    page = words_of(out / "report.html")
     assert f"{found['residual']:.1e}" in page
     assert percent(tissue) in page
 

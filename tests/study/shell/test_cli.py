@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import locale
 import os
@@ -18,6 +17,7 @@ import pytest
 
 from softgrasp.study.shell.streams import write_utf8
 from tests.helpers.browser import look
+from tests.helpers.pages import words_of
 
 ROOT = Path(__file__).parents[3]
 FORWARD = ROOT / "demos" / "scenes" / "paper_forward.toml"
@@ -88,7 +88,7 @@ def test_simulate_writes_what_design_promises(tmp_path: Path, ranks: int) -> Non
     assert result["memory_peak_mb"] > 50  # MiB; Python with PETSc alone needs more
     for name in ("trajectory.csv", "scene.toml", "move.png", "move.gif", "traces.png", "report.html"):
         assert (out / name).stat().st_size > 500, name
-    page = (out / "report.html").read_text()
+    page = words_of(out / "report.html")
     assert "data:image/png;base64" in page
     strains, zone = result["warnings"]  # of the paper's move, and of its cells, which hold from 44/30 on
     assert "small strains" in strains
@@ -97,7 +97,7 @@ def test_simulate_writes_what_design_promises(tmp_path: Path, ranks: int) -> Non
         0.40, abs=0.02
     )  # against finer runs: tests of fem.accuracy
     assert result["time_error"] < 1e-3
-    assert result["warnings"][0] in html.unescape(page)
+    assert result["warnings"][0] in page
     assert run.stdout.count("warning:") == 2
 
 
