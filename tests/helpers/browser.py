@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+import html
 import json
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -29,6 +31,11 @@ ONE_PROCESS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev
 def find_chromium() -> str | None:
     """Path of the first browser that can be driven, if there is one."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+def words_of(page: Path) -> str:
+    """A page with its words as they were written: spaces for no-break ones, marks about names in the type of code."""
+    return html.unescape(re.sub("</?code>", "`", page.read_text())).replace("\u00a0", " ")
 
 
 class Browser:

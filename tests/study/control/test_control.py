@@ -29,9 +29,8 @@ from softgrasp.study.control.plots import drawn, figure_gains, unstable
 from softgrasp.study.control.result import settled
 from softgrasp.study.control.run import run_control, unused_rate
 from softgrasp.study.report.files import to_json
-from tests.helpers.browser import look
+from tests.helpers.browser import look, words_of
 from tests.helpers.models import make_scene
-from tests.helpers.pages import words_of
 
 SCENES = Path(__file__).parents[3] / "demos" / "scenes"
 SMALL = ["tissue.cells=[4,8]", "control.N=[4,8,12]", "output.fields='none'", "reduction.lambda_range=[50.0,50.0]"]

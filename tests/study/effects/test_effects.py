@@ -46,9 +46,8 @@ from softgrasp.study.effects.together import advised, advised_together, finite_s
 from softgrasp.study.effects.verdict import verdict_of
 from softgrasp.study.report.document import show_sections
 from softgrasp.study.shell.timing import RepeatableRun
-from tests.helpers.browser import find_chromium, look
+from tests.helpers.browser import find_chromium, look, words_of
 from tests.helpers.models import LAYERS, close, gather_states, make_scene, write_scene
-from tests.helpers.pages import words_of
 
 QUICK = {"study": {"repeats": 1}, "time": {"steps": 20}}
 CONTROL = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0]}]}}

@@ -16,8 +16,7 @@ from pathlib import Path
 import pytest
 
 from softgrasp.study.shell.streams import write_utf8
-from tests.helpers.browser import look
-from tests.helpers.pages import words_of
+from tests.helpers.browser import look, words_of
 
 ROOT = Path(__file__).parents[3]
 FORWARD = ROOT / "demos" / "scenes" / "paper_forward.toml"
