@@ -13,8 +13,9 @@ import psutil
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.memory import free_bytes, need, steps_of
+from softgrasp.fem.model.memory import factor_bytes, free_bytes, need, steps_of
 from softgrasp.fem.resources import size_text
+from softgrasp.fem.run.contact.expected import ExpectedContact, expected_contact
 from softgrasp.fem.run.frames import frame_count
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.costs import BUILD, ENTRIES, ITERATIVE, SolverName, seams
@@ -42,14 +43,23 @@ class Forecast:
     fields: float  # time of the field files [s]
     frames: int  # number of their instants [1]
     memory: float  # memory over all ranks [byte]
+    contact: float = 0.0  # time of first touches of obstacles and, at most, of steps in contact [s]
 
     @property
     def seconds(self) -> float:
         """Time in all, the start of the command included [s]."""
-        return START + self.build + self.setup + self.equilibrium + self.steps + self.fields
+        return START + self.build + self.setup + self.equilibrium + self.steps + self.fields + self.contact
 
 
-def forecast(scene: Scene, n: int, d: int, cells: int, ranks: int, free: float = np.inf) -> Forecast:
+def forecast(
+    scene: Scene,
+    n: int,
+    d: int,
+    cells: int,
+    ranks: int,
+    free: float = np.inf,
+    touching: ExpectedContact | None = None,
+) -> Forecast:
     """Modelled time and memory of a linear run on so many ranks.
 
     Args:
@@ -57,6 +67,7 @@ def forecast(scene: Scene, n: int, d: int, cells: int, ranks: int, free: float =
         d: dimension.
         cells: triangles or tetrahedra.
         free: memory that the solver may use over all ranks [byte].
+        touching: contact with obstacles, or None.
     """
     kind, work, share = (d, scene.tissue.order), steps_of(scene, n, d, ranks), seams(n, d, ranks)
     name, requested = work.solver(scene.time.solver, free), scene.time.solver
@@ -67,6 +78,8 @@ def forecast(scene: Scene, n: int, d: int, cells: int, ranks: int, free: float =
         memory += work.memory(name)
     if first:  # both are there at once
         memory += static.memory(static.solver(requested))
+    if touching is not None:
+        memory += touching.memory(n, ranks, work.copies(name))
     return Forecast(
         ranks=ranks,
         solver=name,
@@ -77,6 +90,9 @@ def forecast(scene: Scene, n: int, d: int, cells: int, ranks: int, free: float =
         frames=frames,
         fields=frames * FRAME[kind] * cells * share,
         memory=memory,
+        contact=0.0
+        if touching is None
+        else touching.seconds(n, work.solve(name), work.solves, factor_bytes(name, n, d, 1.0)),
     )
 
 
@@ -94,8 +110,10 @@ def forecasts(model: Model, n_e: int | None = None, cells: int | None = None) ->
     comm, cores = layout.comm, psutil.cpu_count(logical=False) or 1
     free = comm.allreduce(free_bytes(scene), MPI.MIN)
     n, simplices = n_e or layout.n_e, cells or model.cells
-    counts = sorted({*RANKS, comm.size})
-    return tuple(forecast(scene, n, layout.dimension, simplices, ranks, free * -(-ranks // cores)) for ranks in counts)
+    counts, touching = sorted({*RANKS, comm.size}), expected_contact(model, n)
+    return tuple(
+        forecast(scene, n, layout.dimension, simplices, ranks, free * -(-ranks // cores), touching) for ranks in counts
+    )
 
 
 def told(results: Sequence[Forecast]) -> str:

@@ -14,8 +14,9 @@ from softgrasp.fem.model.outputs import make_outputs, output_columns
 from softgrasp.fem.model.surface import Surface, make_surface, node_distance
 from softgrasp.fem.obstacles import HalfSpace, Obstacle, make_obstacles
 from softgrasp.fem.petsc import Array, normalising, times_columns, total
+from softgrasp.fem.run.contact.expected import nearest_gaps
 from softgrasp.fem.run.midpoint import viscosity
-from softgrasp.fem.run.motion import HandTable, motion_table
+from softgrasp.fem.run.motion import motion_table
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.stiffness import static_columns
 from softgrasp.reduction.contact.model import ContactModel, Ints, plane
@@ -59,7 +60,7 @@ def contact_model(model: Model, modes: int = 10, reach: float | None = None, row
         scene.time_end / scene.time.steps,
     )
     near = node_distance(model.space) / 2 if reach is None else reach
-    kept = np.flatnonzero(_nearest(surface, obstacles, table, dt) < near)
+    kept = np.flatnonzero(nearest_gaps(surface, obstacles, table.q, dt, len(table.q)).min(axis=0) < near)
     if not len(kept):
         raise ModelError(f"no boundary node comes within reach = {near:.3g} m of an obstacle; give a larger reach")
     if rows is not None:  # a hat goes along one face: of what lies above another node none
@@ -107,19 +108,10 @@ def reachable(model: Model) -> tuple[int, int]:
     scene, layout = model.scene, model.system.layout
     obstacles = check_contact_scene(model)
     table, dt = motion_table(scene, layout.n_s), scene.time_end / scene.time.steps
-    least = _nearest(make_surface(model.space, model.system), obstacles, table, dt)
+    surface = make_surface(model.space, model.system)
+    least = nearest_gaps(surface, obstacles, table.q, dt, len(table.q)).min(axis=0)
     normals = {tuple(plane(o)[0].tolist()) for o in obstacles}
     return int((least < node_distance(model.space) / 2).sum()), len(normals)
-
-
-def _nearest(surface: Surface, obstacles: tuple[Obstacle, ...], table: HandTable, dt: float) -> Array:
-    """Least gap of each boundary node while the undeformed body follows the hand, (p,) [m]."""
-    least = np.full(len(surface.X), np.inf)
-    for n, q in enumerate(table.q):
-        x = surface.places(q)
-        for obstacle in obstacles:
-            least = np.minimum(least, obstacle.gap(x, n * dt))
-    return least
 
 
 def _foremost(X: Array, kept: Ints, obstacles: tuple[Obstacle, ...], distance: float) -> Ints:

@@ -92,16 +92,18 @@ def _operators(names: Sequence[str]) -> str:
 
 def forecast_section(forecasts: Sequence[Forecast]) -> list[Section]:
     """Modelled time and memory of the run by the number of ranks."""
+    contact = any(f.contact for f in forecasts)
     rows = [
-        (f.ranks, f.solver, *(f"{x:.2g} s" for x in (f.build, f.setup, f.equilibrium, f.steps, f.fields, f.seconds)),
-         size_text(f.memory))
+        (f.ranks, f.solver, *(f"{x:.2g} s" for x in (f.build, f.setup, f.equilibrium, f.steps, f.fields)),
+         *([f"{f.contact:.2g} s"] if contact else []), f"{f.seconds:.2g} s", size_text(f.memory))
         for f in forecasts
     ]  # fmt: skip
+    header = (*FORECAST[:-2], *(["contact"] if contact else []), *FORECAST[-2:])
     text = (
         f"A model, {RELIABLE}. Ranks beyond the cores of this node are on more nodes like it. {START:g} s in all are "
         "for the start and a page; pictures and the estimate of the mesh come on top."
     )
-    return [Section("What simulate costs, by the cost model", text, header=FORECAST, rows=rows)] if rows else []
+    return [Section("What simulate costs, by the cost model", text, header=header, rows=rows)] if rows else []
 
 
 def summary(result: Explanation) -> list[str]:

@@ -1,0 +1,79 @@
+"""What contact needs in a run, estimated before it: as many columns as nodes are on the way of the undeformed body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.surface import Surface, make_surface, node_distance
+from softgrasp.fem.obstacles import HalfSpace, Obstacle, make_obstacles
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.motion import motion_table
+from softgrasp.fem.run.snapshots import spread
+
+INSTANTS = 200  # of a prescribed motion, at which gaps are computed
+REACHED = {2: 4000, 3: 40_000}  # nodes that a column of M^-1 reaches before rounding, by dimension [1]
+MASS = {2: 2e-7, 3: 7e-7}  # time of such a column, by dimension [s a node that it reaches]
+SQUARES = 5  # matrices over the rows, W = N S^-1 N', its factor, those of impulses, and room for twice the rows
+
+
+@dataclass(frozen=True)
+class ExpectedContact:
+    """Size of the contact of a run."""
+
+    nodes: int  # boundary nodes that should touch [1]
+    columns: int  # of S^-1 N' [1]
+    surface: int  # unknowns of the boundary [1]
+    dimension: int  # axes [1]
+
+    def memory(self, n: int, ranks: int, copies: float) -> float:
+        """Memory over all ranks [byte] with n unknowns, of which ``copies`` are kept."""
+        columns = 8.0 * self.columns * (copies * n + ranks * self.surface)
+        return columns + ranks * (24.0 * self.nodes * self._reached(n) + SQUARES * 8.0 * (2 * self.columns) ** 2)
+
+    def seconds(self, n: int, solve: float, steps: int, factor: float) -> float:
+        """Time of first touches, a solve of ``solve`` [s] each, and of all steps in contact [s], at most.
+
+        A step in contact reads the columns, or takes one more solve with a factor of ``factor`` bytes.
+        """
+        step = solve * min(1.0, 8.0 * self.columns * n / max(2 * factor, 1.0))
+        return self.columns * solve + self.nodes * self._reached(n) * MASS[self.dimension] + steps * step
+
+    def _reached(self, n: int) -> int:
+        return min(n // self.dimension, REACHED[self.dimension])
+
+
+def expected_contact(model: Model, n: int | None = None) -> ExpectedContact | None:
+    """Contact of a run, or None without; with n unknowns on a mesh of the same shape. Collective.
+
+    Nodes that a prescribed hand leads nearer than half their distance to an obstacle should touch; under a hand that a
+    force drives, those that are the nearest to it at the start.
+    """
+    scene, layout = model.scene, model.system.layout
+    if not scene.effects.obstacles:
+        return None
+    surface, obstacles = make_surface(model.space, model.system), make_obstacles(scene, layout.dimension)
+    near, d = node_distance(model.space) / 2, layout.dimension
+    free = scene.motion.drive == "force"
+    q = np.zeros((1, layout.n_s)) if free else motion_table(scene, layout.n_s).q
+    gaps = nearest_gaps(surface, obstacles, q, scene.time_end / scene.time.steps)
+    touching = gaps < (gaps.min(axis=1, keepdims=True) + near if free else near)
+    entries = scene.obstacle or []
+    straight = [isinstance(o.shape, HalfSpace) and not e.friction for o, e in zip(obstacles, entries, strict=True)]
+    finer = ((n or layout.n_e) / layout.n_e) ** ((d - 1) / d)
+    columns = int(touching.sum(axis=1) @ np.where(straight, 1, d))
+    sizes = int(touching.any(axis=0).sum()), columns, surface.X.size
+    return ExpectedContact(*(round(finer * size) for size in sizes), d)
+
+
+def nearest_gaps(
+    surface: Surface, obstacles: tuple[Obstacle, ...], q: Array, dt: float, instants: int = INSTANTS
+) -> Array:
+    """Least gaps of the boundary nodes while the undeformed body follows the hand q, (obstacles, p) [m]."""
+    least = np.full((len(obstacles), len(surface.X)), np.inf)
+    for n in spread(len(q), instants).tolist():
+        x = surface.places(q[n])
+        least = np.minimum(least, [o.gap(x, n * dt) for o in obstacles])
+    return least
