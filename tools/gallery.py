@@ -23,7 +23,7 @@ from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 SKIP = "SOFTGRASP_TUTORIALS"  # "none": pages without outputs, in no time
-LIMIT = 600  # [s] for one cell
+LIMIT = 600  # [s] for one cell, and for the start of its kernel on a machine with other work
 QUIET = {"extra_arguments": ["--log-level=40"]}  # of the kernel: errors only
 INLINE = "module://matplotlib_inline.backend_inline"
 THUMBNAIL = (480, 300)  # [px]
@@ -90,7 +90,9 @@ def execute(book: Any, name: str) -> None:
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1", "MPLBACKEND": INLINE}
     with TemporaryDirectory() as folder:
-        client = nbclient.NotebookClient(book, timeout=LIMIT, resources={"metadata": {"path": folder}}, **QUIET)
+        client = nbclient.NotebookClient(
+            book, timeout=LIMIT, startup_timeout=LIMIT, resources={"metadata": {"path": folder}}, **QUIET
+        )
         try:
             client.execute(env=environment)
         except nbclient.exceptions.CellExecutionError as error:
