@@ -154,8 +154,8 @@ class Output(Section):
         "auto", description="where states go; auto: memory, in `simulate` the few that its warnings look at [no unit]"
     )
     every: Annotated[int, Field(ge=1)] = Field(1, description="a snapshot every so many steps [1]")
-    fields: Literal["vtu", "none"] = Field(
-        "vtu", description="field files, a list fields.pvd of VTK's .vtu files, or none [no unit]"
+    fields: Literal["vtu", "vtkhdf", "none"] = Field(
+        "vtu", description="field files, a list fields.pvd of .vtu files, one VTKHDF file a field, or none [no unit]"
     )
     frames: Literal["auto"] | Annotated[int, Field(ge=1)] = Field(
         "auto", description="frames in field files and animations [1]; auto: 60 up to 1e5 unknowns, 10 from 6e5 on"

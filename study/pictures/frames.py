@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softgrasp.fem import Array, Model, Run, SeriesWriter, Trajectory, frame_steps, note_of, remove_own, total
+from softgrasp.fem import Array, Model, Run, Trajectory, field_writer, frame_steps, note_of, remove_own, run_of, total
 from softgrasp.fem.checksums import AGAIN, read_arrays, write_arrays
 from softgrasp.fem.errors import CheckpointError, raise_on_all_ranks
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement, vertex_values
@@ -30,7 +30,7 @@ class Frames:
 
     def __init__(self, model: Model, directory: Path, pictures: bool = True) -> None:
         self.model, self.directory, self.pictures = model, directory, pictures
-        self.writer = SeriesWriter(model, directory) if model.scene.output.fields != "none" else None
+        self.writer = field_writer(model, directory)
         self.legs = [0]
         self.foreign = False  # another run wrote in place of the field files of an earlier leg; rank 0 only
         self.saved = 0  # of the frames below, how many lie beside the checkpoint
@@ -75,6 +75,12 @@ class Frames:
                 continue
             self.foreign = self.foreign or path.stem in own
             remove_own(self.directory, path.with_suffix(""), path)
+        for path in self.directory.glob("fields*-*.vtkhdf"):
+            left = path.stem.rsplit("-", 1)[0] in own
+            if left and run_of(path) == run.name:
+                continue
+            self.foreign = self.foreign or left
+            remove_own(self.directory, path)
 
     def _load(self, run: Run) -> None:
         frames = [
@@ -153,8 +159,11 @@ class Frames:
     def close(self) -> list[Path]:
         """Finish the field files; those of all legs. Collective."""
         own = list(self.writer.close()) if self.writer is not None else []
-        earlier = [self.directory / f"{_series(leg)}.pvd" for leg in self.legs[:-1]]
-        return [path for path in earlier if path.exists()] + own
+        earlier = []
+        for stem in map(_series, self.legs[:-1]):
+            files = [self.directory / f"{stem}.pvd", *sorted(self.directory.glob(f"{stem}-*.vtkhdf"))]
+            earlier += [path for path in files if path.exists() and path.stem.rsplit("-", 1)[0] == stem]
+        return earlier + own
 
     def draw(self, directory: Path, run: Trajectory) -> list[Path]:
         """Figures and animation; rank 0 only."""

@@ -45,6 +45,8 @@ class Move:
         if (folder / "fields.pvd").exists():
             parts[0] = folder / "fields.pvd"
         series = [entries for step in sorted(parts) if (entries := _series(parts[step]))]
+        if not series and any(folder.glob("fields*.vtkhdf")):
+            raise SceneError(f"{folder} has VTKHDF files, for ParaView; view reads those of output.fields = 'vtu'")
         if not series:
             raise SceneError(f"{folder} has no field files; name the output folder of simulate or control")
         ends = [entries[0][0] for entries in series[1:]] + [np.inf]

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from softgrasp.fem.fields.hdf import HdfWriter, run_of
 from softgrasp.fem.fields.series import SeriesWriter
 from softgrasp.fem.fields.stress import CellStress
 from softgrasp.fem.fields.vtu import note_of
@@ -39,17 +40,64 @@ def affine(d: int) -> np.ndarray:
 
 
 def write(comm: MPI.Intracomm, folder: Path, d: int, order: int, **extra: Any) -> Path:
+    """The files of `instants` in one list."""
+    (path,) = instants(comm, folder, d, order, SeriesWriter, **extra)
+    return path
+
+
+def instants(
+    comm: MPI.Intracomm, folder: Path, d: int, order: int, kind: type[SeriesWriter], **extra: Any
+) -> tuple[Path, ...]:
     """The start, the hand's move, and u = A x on the free nodes."""
     model, q = make_model(comm, d, order, **extra), hand_of(d)
     zero = np.zeros(model.system.layout.n_local)
-    writer = SeriesWriter(model, folder / "new")
+    writer = kind(model, folder / "new")
     writer.rename("fields", "a run")
     writer.write(0.0, zero, zero, 0 * q, 0 * q)
     writer.write(0.5, zero, zero, q, 2 * q)
     writer.write(np.float64(1.0), (model.system.layout.nodes @ affine(d).T).ravel(), zero, 0 * q, 0 * q)
-    (path,) = writer.close()
+    paths = writer.close()
     comm.Barrier()
-    return path
+    return paths
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("d", [2, 3])
+def test_vtk_reads_the_hdf_files(comm: MPI.Intracomm, mpi_tmp_path: Path, d: int, order: int) -> None:
+    paths = instants(comm, mpi_tmp_path, d, order, HdfWriter)
+    if comm.rank == 0:
+        from vtkmodules.util.numpy_support import vtk_to_numpy
+        from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+        from vtkmodules.vtkIOHDF import vtkHDFReader
+
+        names = ["displacement", "velocity", "strain", "stress", "von_mises"]
+        assert [path.name for path in paths] == [f"fields-{name}.vtkhdf" for name in names]
+        assert {run_of(path) for path in paths} == {"a run"}
+        for path in paths:
+            reader = vtkHDFReader()
+            reader.SetFileName(str(path))
+            reader.UpdateInformation()
+            when = reader.GetOutputInformation(0).Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS())
+            assert when == (0.0, 0.5, 1.0)
+            reader.SetStep(2)
+            reader.Update()
+            grid = reader.GetOutput()
+            x, u = vtk_to_numpy(grid.GetPoints().GetData())[:, :d], grid.GetPointData().GetArray("u")
+            if path is paths[0]:
+                free = np.abs(vtk_to_numpy(u)).max(axis=1) > 1e-9  # the rest is held, to rounding
+                assert 0 < free.sum() < len(x)
+                np.testing.assert_allclose(vtk_to_numpy(u)[free, :d], (x @ affine(d).T)[free], atol=EXACT)
+            elif path is paths[1]:
+                reader.SetStep(1)
+                reader.Update()
+                v = vtk_to_numpy(reader.GetOutput().GetPointData().GetArray("u"))
+                np.testing.assert_allclose(v[:, :d], turned(x, 2 * hand_of(d)), atol=2 * EXACT)
+            elif path is paths[2]:  # the body has cells without a held node
+                e, A = vtk_to_numpy(grid.GetCellData().GetArray("u")), affine(d)
+                assert np.abs(e[:, 3] - (A[0, 1] + A[1, 0]) / 2).min() < SINGLE
+            else:
+                assert grid.GetCellData().GetArray("u").GetNumberOfTuples() == grid.GetNumberOfCells() > 0
+    comm.Barrier()
 
 
 @pytest.mark.parametrize("order", [1, 2, 3])
