@@ -161,8 +161,9 @@ class Frames:
         own = list(self.writer.close()) if self.writer is not None else []
         earlier = []
         for stem in map(_series, self.legs[:-1]):
-            files = [self.directory / f"{stem}.pvd", *sorted(self.directory.glob(f"{stem}-*.vtkhdf"))]
-            earlier += [path for path in files if path.exists() and path.stem.rsplit("-", 1)[0] == stem]
+            hdf = sorted(self.directory.glob(f"{stem}-*.vtkhdf"))
+            earlier += [path for path in [self.directory / f"{stem}.pvd"] if path.exists()]
+            earlier += [path for path in hdf if path.stem.rsplit("-", 1)[0] == stem]
         return earlier + own
 
     def draw(self, directory: Path, run: Trajectory) -> list[Path]:
