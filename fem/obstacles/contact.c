@@ -271,11 +271,11 @@ void softgrasp_strike(const Flat *f, int n, double *v) {
   const int d = f->d, m = f->n_s, own = f->feels, nodes = f->here / d;
   double *impulse = f->impulse + (size_t)n * f->obstacles * d, *force = f->force + (size_t)n * f->obstacles * d;
   double *kick = f->kick + (size_t)n * m, a[MODES] = {0}, b[MODES] = {0}, wrench[MODES] = {0}, work = 0, t[12] = {0};
-  const double *only = 0;
+  const double *only = f->along;
   int ways = 1, count = 0, columns[4], last = -1;
   for (int j = 0; j < f->k; j++) {
     if (f->y[j] == 0) continue;
-    if (only && only != along(f, f->row + 4 * j)) ways = d;
+    if (last >= 0 && only != along(f, f->row + 4 * j)) ways = d;
     only = along(f, f->row + 4 * j);
     last = j;
   }

@@ -34,7 +34,7 @@ class CompiledStep:
 
     def __init__(self, compiled: Any, tissue: Any) -> None:
         self._ffi, self._code = compiled
-        self._body, self._gravity, self._data = tissue.body, tissue.mj_model.opt.gravity, None
+        self._body, self._gravity, self._data = tissue.body, tissue._gravity, None
         self._root, self._flies = tissue.mj_model.body_rootid[self._body], tissue._flight is not None
         small, k, nv = tissue.small, len(tissue.a), tissue.mj_model.nv
         sizes = {"k": k, "n": nv, "3": 3, "6": 6, "9": 9, "r": 28}

@@ -86,11 +86,11 @@ class FreeFlight:
         self._x, self._R, self._w = data.qpos[self._at][:3] + self._arm, R, v[3:].copy()
         self._q = data.qpos[self._at][3:].copy()
 
-    def keep(self, data: Any, h: float, inertia: Array, moving: Array, given: Array) -> None:
+    def keep(self, data: Any, h: float, gravity: Array, inertia: Array, moving: Array, given: Array) -> None:
         """Set velocity, axes and place of the root after a step in which the tissue gave ``given`` (nv,)."""
         mass, rest, c = self._momenta(inertia, moving)
         force = (data.qfrc_smooth + data.qfrc_bias - given)[self._dofs]  # MuJoCo's bias has the weight, too
-        P = self._P + h * (force[:3] + mass[0, 0] * self._model.opt.gravity)
+        P = self._P + h * (force[:3] + mass[0, 0] * gravity)
         L = self._L + h * (self._R @ force[3:] - np.cross(self._arm, force[:3]))
 
         def reached(R: Array) -> Array:

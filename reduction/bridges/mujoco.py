@@ -106,6 +106,7 @@ class MujocoTissue:
         self._loads, self._forces = np.ascontiguousarray(sums), np.hstack([small.K, small.D + dt / 2 * small.K])
         self._turns = np.vstack([np.zeros((2, 9)), AXES.reshape(3, 9)])
         self._J, self._Jd, self._six = np.zeros((6, nv)), np.zeros((6, nv)), np.zeros((6, 6))
+        self._gravity, self._weightless = np.zeros(3), int(self.mujoco.mjtDisableBit.mjDSBL_GRAVITY)
         self._flight = FreeFlight.of(self.mujoco, mj_model, self.body)
         self._rows = np.repeat(np.arange(nv, dtype=np.intc), mj_model.M_rownnz)  # of the lower triangle in M
         self._columns = np.array(mj_model.M_colind, dtype=np.intc)
@@ -123,7 +124,7 @@ class MujocoTissue:
     def settle(self, data: Any) -> None:
         """Start at rest, deformed by gravity as it acts in the axes of the body."""
         self.mujoco.mj_forward(self.mj_model, data)
-        fall = data.xmat[self.body].reshape(3, 3).T @ self.mj_model.opt.gravity
+        fall = data.xmat[self.body].reshape(3, 3).T @ self._fall()
         self.a = np.linalg.solve(self.small.K, self.small.G[:, :3] @ fall)
         self.e, self._past[:], self._rate[:] = np.zeros_like(self.a), 0.0, 0.0
 
@@ -133,6 +134,7 @@ class MujocoTissue:
         Raises ModelError: the state is no longer finite.
         """
         mujoco, model = self.mujoco, self.mj_model
+        self._fall()
         mujoco.mj_step1(model, data)
         mujoco.mj_jacBody(model, data, self._J[:3], self._J[3:], self.body)
         mujoco.mj_jacDot(model, data, self._Jd[:3], self._Jd[3:], data.xpos[self.body], self.body)
@@ -152,6 +154,12 @@ class MujocoTissue:
             self._code.keep()
         self.a, self.e, self.wrench = self._code.state()
 
+    def _fall(self) -> Array:
+        """Gravity as it acts, in space (3,) [m/s^2]: none where the flag of the model disables it."""
+        option = self.mj_model.opt
+        self._gravity[:] = 0.0 if option.disableflags & self._weightless else option.gravity
+        return self._gravity
+
     def _in_numpy(self, data: Any) -> None:
         """The step after the Jacobian is known."""
         mujoco, model, six, flight = self.mujoco, self.mj_model, self._six, self._flight
@@ -161,7 +169,7 @@ class MujocoTissue:
         b = six @ (self._Jd @ before)
         if flight is not None:
             flight.depart(data, *self._moved())
-        inertia, force, right, G = self._known(J[3:] @ before, Q.T @ model.opt.gravity)
+        inertia, force, right, G = self._known(J[3:] @ before, Q.T @ self._gravity)
         data.M[:] += (J.T @ inertia @ J)[self._rows, self._columns]
         mujoco.mj_factorM(model, data)
         user = data.qfrc_applied.copy()
@@ -175,7 +183,7 @@ class MujocoTissue:
         self.wrench = -(inertia @ acceleration + force)
         if flight is not None and not flight.is_held(data):
             flight.rest(data)
-            flight.keep(data, self.dt, *self._moved(), given)
+            flight.keep(data, self.dt, self._gravity, *self._moved(), given)
 
     def _moved(self) -> tuple[Array, Array]:
         """M_a and G_a'e, which give the momenta of the deformation, (6, 6) and (6,)."""

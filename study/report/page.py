@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup, escape
+from markupsafe import Markup
 from PIL import Image
 
 from softgrasp.fem import Scene, note, resolved_toml
@@ -157,7 +157,8 @@ def _prepared(section: Section) -> dict[str, Any]:
 
 def words(text: str) -> Markup:
     """A sentence as the page shows it: `names` in the type of code."""
-    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(unbroken(text)))))
+    parts = re.split(r"`([^`]+)`", text)
+    return Markup().join(Markup("<code>{}</code>").format(p) if i % 2 else unbroken(p) for i, p in enumerate(parts))
 
 
 def paragraphs(text: str) -> list[str]:

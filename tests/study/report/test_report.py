@@ -89,11 +89,13 @@ def test_a_page_that_loads_something_is_seen(mark: str) -> None:
 
 def test_no_line_ends_between_a_number_and_its_unit_but_commands_stay_as_they_are_typed(tmp_path: Path) -> None:
     parts = [
-        Section("T", text="It is 0.52 % or 3 m/s in 3 `<steps>`.", code="sleep 3 s"),
+        Section("T", text="It is 0.52 % or 3 m/s in 3 `<steps> 4 s`.", code="sleep 3 s"),
         Section("", rows=[("a", "2 Pa")]),
     ]
-    html = write_report(tmp_path / "report.html", Page("t", (), parts, command="run 5 m")).read_text()
-    assert "0.52\u00a0% or 3\u00a0m/s in 3 <code>&lt;steps&gt;</code>." in html
+    page, files = Page("t", (), parts, command="run 5 m"), [tmp_path / "at 6 s.csv"]
+    html = write_report(tmp_path / "report.html", page, files=files).read_text()
+    assert "0.52\u00a0% or 3\u00a0m/s in 3 <code>&lt;steps&gt; 4 s</code>." in html
+    assert '<a href="at 6 s.csv">' in html
     assert "2\u00a0Pa" in html
     assert "sleep 3 s" in html
     assert "run 5 m" in html
