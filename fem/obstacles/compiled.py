@@ -5,12 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from softgrasp.fem.strain.compiled import library
 
 SOURCE = Path(__file__).with_name("contact.c")
-HEADERS = tuple(SOURCE.with_name(name) for name in ("dense.h", "flat.h", "pivots.h", "rub.h"))
+HEADERS = tuple(SOURCE.with_name(name) for name in ("dense.h", "flat.h", "pivots.h", "rub.h", "triangle.h"))
 RIDGE = 1e-13  # share of the diagonal that makes equal rows share their force [1]
 RETRIES = 3  # rounds without progress before rows change sides one by one
+KINDS = {
+    np.dtype(float): "double[]", np.dtype(np.float32): "float[]", np.dtype(np.intc): "int[]", np.dtype(bool): "char[]",
+    np.dtype(np.int8): "char[]", np.dtype(np.int64): "long[]",
+}  # fmt: skip
+"""Types of arrays in C."""
 DEFINED = (f"RIDGE={RIDGE!r}", f"RETRIES={RETRIES}")
 
 

@@ -5,10 +5,11 @@
 y_t half the slip of the step; a node has one tangent in 2D and two in 3D. Newton's method on the sets open, stick
 and slip [AC91]: in 2D it is exact when the sets stay, in 3D the directions of slipping nodes converge with it. Its
 factor stays while few rows of the matrix are others, which a small matrix of their own takes in; in 3D Broyden's update
-takes in the directions, and rounds that reduce the residual little have it made anew. Where the method comes back to
-sets seen before, sweeps of Gauss-Seidel over the nodes find others; then pivots do (`lemke.py`), which in 2D end at a
-solution but for rounding, and in 3D lead to one by pyramids with edges nearer and nearer to the slips, or friction that
-grows. `friction.c` does so; without a compiler NumPy takes the same rounds, each with a factor of its own.
+takes in the directions, and rounds that reduce the residual little have it made anew; for many nodes it is in single
+precision, unless this leads nowhere. Where the method comes back to sets seen before, sweeps of Gauss-Seidel find
+others; then pivots do (`lemke.py`), which in 2D end at a solution but for rounding, and in 3D lead to one by pyramids
+with edges nearer and nearer to the slips, or friction that grows. `friction.c` does so; without a compiler NumPy takes
+the same rounds, each with a factor of its own.
 """
 
 from __future__ import annotations
@@ -18,22 +19,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgetrf
+from scipy.linalg.lapack import dgetrf, sgetrf
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.obstacles.compiled import RIDGE, friction_library
+from softgrasp.fem.obstacles.compiled import KINDS, RIDGE, friction_library
 
 Array = NDArray[Any]
 OPEN, STICK, SLIP = range(3)
 ROUNDS = 0, 40, 60  # of Newton's method, before and after the sweeps, by the number of tangents
 SWEEPS = 3000
 PAST = 16  # steps of the method that are kept, one more than friction.c says
+SINGLE = 100  # nodes from which factors in 3D are in single precision, in half the time
 STILL = 1e-14  # change of the forces by a sweep over the largest, at which sweeps end
-LITTLE = 0.2  # first coefficient of friction that grows
-GROWTH, LEAST = 1.4, 1.04  # by how much it does, and by how much it must
+LITTLE, GROWTH, LEAST = 0.2, 1.4, 1.04  # first coefficient of friction that grows, by how much it does, and must
 REFINED = 6  # pyramids, each with edges three times as near to the last directions
 NEARLY = 1e-9  # of a force, below which its node slips, or is open [1]
-KINDS = {np.dtype(float): "double[]", np.dtype(np.intc): "int[]", np.dtype(np.int8): "char[]"}  # in C
 SOLVED, WANTED = 0, 1  # what `softgrasp_rub` says; else the rounds lead nowhere
 
 
@@ -77,25 +77,29 @@ class Coulomb:
         self.kind0, self.e0, self.before, self.had = kind.copy(), e.copy(), np.zeros_like(x), False
         if self.code is None:
             return
-        K = k * s
-        most = max(6, min(K // 6, 24))
+        K, most = k * s, max(6, min(k * s // 6, 24))
         self.other = np.zeros(most, np.intc)
-        self.LU, self.pivot, self.y = np.zeros(K * K), np.zeros(K, np.intc), np.zeros(K)
+        self.pivot, self.y = np.zeros(K, np.intc), np.zeros(K)
+        self._use(self.m > 1 and k >= SINGLE)
         self._point(
-            before=self.before, x=self.x, y=self.y, kind=self.kind, e=self.e, LU=self.LU, pivot=self.pivot,
+            before=self.before, x=self.x, y=self.y, kind=self.kind, e=self.e, pivot=self.pivot,
             kind0=self.kind0, e0=self.e0, other=self.other, Z=np.zeros((most, K)), V=np.zeros((most, K)),
             C=np.zeros((most, most)), room=np.zeros(6 * K + most), past=np.zeros((PAST, K)),
             seen=np.zeros((ROUNDS[self.m], k), np.int8), tally=self.tally,
         )  # fmt: skip
         self.f.k, self.f.m, self.f.most, self.f.rows, self.f.count = k, self.m, most, 0, 0
 
+    def _use(self, single: bool) -> None:
+        """Room for a factor in single precision or in double."""
+        self.LU, self.f.single, self.f.rows = np.zeros(len(self.pivot) ** 2, np.float32 if single else float), single, 0
+        self._point(**{"LU_single" if single else "LU": self.LU})
+
     def _point(self, **arrays: NDArray[Any]) -> None:
         """Let fields of the struct point at arrays, which are kept."""
         for name, array in arrays.items():
             if self.arrays.get(name) is array:
                 continue
-            kind = KINDS.get(array.dtype, "long[]")
-            setattr(self.f, name, self.code[0].from_buffer(kind, array))
+            setattr(self.f, name, self.code[0].from_buffer(KINDS[array.dtype], array))
             self.arrays[name] = array
 
     def forget(self) -> None:
@@ -198,8 +202,7 @@ class Coulomb:
                 more = math.sqrt(more)
                 self.x[:], self.kind[:], self.e[:] = kept
                 continue
-            reached *= more
-            if reached >= mu.max():
+            if (reached := reached * more) >= mu.max():
                 return True
             kept = self.x.copy(), self.kind.copy(), self.e.copy()
         return False
@@ -211,9 +214,12 @@ class Coulomb:
         self.code[1].softgrasp_sweep(self.f, SWEEPS, STILL)
         self.forget()
         kept = self.x.copy(), self.kind.copy(), self.e.copy()
-        if self._rounds():
-            return True
-        self.x[:], self.kind[:], self.e[:] = kept
+        for single in (True, False) if self.f.single else (False,):
+            if self.f.single != single:  # from now on
+                self._use(single)
+            if self._rounds():
+                return True
+            self.x[:], self.kind[:], self.e[:] = kept
         self.forget()
         return bool(self.code[1].softgrasp_wrong(self.f) <= tol)
 
@@ -237,7 +243,7 @@ class Coulomb:
         self.code[1].softgrasp_matrix(self.f)
         if n := int(self.f.size):  # else all nodes are open
             matrix = self.LU[: n * n].reshape(n, n).T
-            lu, self.pivot[:n], _ = dgetrf(matrix, overwrite_a=True)
+            lu, self.pivot[:n], _ = (sgetrf if self.f.single else dgetrf)(matrix, overwrite_a=True)
             if not np.shares_memory(lu, self.LU):
                 matrix[:] = lu
 
@@ -245,9 +251,8 @@ class Coulomb:
 
     def state(self) -> Array:
         """Numbers from which a run continues with the same bits."""
-        count = 0 if self.f is None else int(self.f.count)
-        rows = 0 if self.f is None else int(self.f.rows)
-        head = np.array([len(self.kind), rows, count, *self.tally[:2], self.had], dtype=float)
+        count, rows, single = (0, 0, 0) if self.f is None else (self.f.count, self.f.rows, self.f.single)
+        head = np.array([len(self.kind), rows, count, *self.tally[:2], self.had, single], dtype=float)
         parts = self.x, self.kind, self.e, self.kind0, self.e0, self.other[:count], self.before
         return np.concatenate([head, *(np.asarray(part, dtype=float).ravel() for part in parts)])
 
@@ -258,10 +263,12 @@ class Coulomb:
         self.fit(k)
         self.tally[:2] = numbers[3:5]
         sizes = [k * s, k, k * s, k, k * s, count]
-        x, kind, e, kind0, e0, other, before = np.split(numbers[6:], np.cumsum(sizes))
+        x, kind, e, kind0, e0, other, before = np.split(numbers[7:], np.cumsum(sizes))
         self.before[:], self.had = before.reshape(k, s), bool(numbers[5])
         self.x[:], self.e[:] = x.reshape(k, s), e.reshape(k, s)
-        if self.f is not None and rows:
+        if self.f is not None:
+            self._use(bool(numbers[6]))
+        if rows and self.f is not None:
             self._point(W=W, mu=mu)
             self.f.ld = W.shape[1]
             self.kind[:], self.e[:] = kind0, e0.reshape(k, s)
@@ -389,7 +396,5 @@ class Coulomb:
         z = x[:, 1:] - y[:, 1:] / w[:, 1:2]
         size, most = np.linalg.norm(z, axis=1), mu * np.maximum(x[:, 0], 0.0)
         z *= np.where(size > most, most / np.where(size > 0, size, 1.0), 1.0)[:, None]
-        return float(max(
-            (np.abs(x[:, 0] - np.maximum(0.0, x[:, 0] - y[:, 0] / w[:, 0])) * w[:, 0]).max(initial=0.0),
-            (np.abs(x[:, 1:] - z) * w[:, 1:2]).max(initial=0.0),
-        ))  # fmt: skip
+        normal = np.abs(x[:, 0] - np.maximum(0.0, x[:, 0] - y[:, 0] / w[:, 0])) * w[:, 0]
+        return float(max(normal.max(initial=0.0), (np.abs(x[:, 1:] - z) * w[:, 1:2]).max(initial=0.0)))

@@ -3,9 +3,22 @@
 #pragma once
 #include "dense.h"
 
+#define REAL double
+#define DOT dot_in_double
+#define BACK back_in_double
+#include "triangle.h"
+#undef REAL
+#undef DOT
+#undef BACK
+#define REAL float
+#define DOT dot_in_float
+#define BACK back_in_float
+#include "triangle.h"
+
 enum { OPEN, STICK, SLIP };
 enum { SOLVED = 0, WANTED = 1, CYCLED = 2 };
 enum { LATE = 2, PAST = 15 };        /* steps that are kept, at most */
+static const double RIDGE_SINGLE = 1e-7; /* as RIDGE, of a factor in single precision */
 static const double SLOW = 0.3; /* by how much a round should reduce the residual */
 
 typedef struct {
@@ -17,7 +30,9 @@ typedef struct {
   int *kind;             /* sets (k) */
   double *e;             /* of a slipping node: direction of its force, and mu x_n over |x_t - y_t / W_tt| (k (m + 1)) */
   int rows, size;        /* K = k (1 + m) where there is a factor, else 0; its unknowns */
-  double *LU;            /* factor, by columns (size, size) */
+  int single;            /* whether the factor is in single precision */
+  double *LU;            /* factor of the transpose, by columns (size, size), */
+  float *LU_single;      /* or this one */
   int *pivot;
   int *kind0;            /* sets and directions that it is of */
   double *e0;
@@ -56,25 +71,35 @@ static void row_of(const Rub *f, int i, int a, int kind, const double *e, double
 
 /* A row v (K) of J times d, d the unknowns of the factor: (n, t..) of a sticking node, n of a slipping one and, with two
    tangents, the way p across its direction e; d_t = (mu d_n) e + d_p p, and open nodes have none. */
-static void shorten(const Rub *f, const double *v, double *to, int step) {
+static void shorten(const Rub *f, const double *v, double *to) {
   const int s = 1 + f->m;
   for (int j = 0; j < f->k; j++, v += s) {
     const double *e = f->e0 + j * s;
     if (f->kind0[j] == OPEN) continue;
-    double n = v[0];
-    for (int b = 0; f->kind0[j] == SLIP && b < f->m; b++) n += f->mu[j] * e[b] * v[1 + b];
-    *to = n;
-    to += step;
-    if (f->kind0[j] == STICK)
-      for (int b = 0; b < f->m; b++, to += step) *to = v[1 + b];
-    else if (f->m > 1) *to = e[0] * v[2] - e[1] * v[1], to += step;
+    if (f->kind0[j] == STICK) {
+      for (int b = 0; b < s; b++) *to++ = v[b];
+    } else if (f->m == 1) {
+      *to++ = v[0] + f->mu[j] * e[0] * v[1];
+    } else {
+      *to++ = v[0] + f->mu[j] * (e[0] * v[1] + e[1] * v[2]);
+      *to++ = e[0] * v[2] - e[1] * v[1];
+    }
   }
 }
 
-/* The matrix of the present sets without what single rows say, by columns, into LU. */
+/* The row of a slipping node across its direction, with two tangents. */
+static void across(const Rub *f, int i, const double *e, double *restrict v) {
+  const int K = 3 * f->k, r = 3 * i + 1;
+  const double *W = f->W + (size_t)r * f->ld, *W2 = W + f->ld, own = diagonal(f, r) * (1 - e[2]);
+  for (int j = 0; j < K; j++) v[j] = e[2] * (e[0] * W2[j] - e[1] * W[j]);
+  v[r] -= own * e[1];
+  v[r + 1] += own * e[0];
+}
+
+/* The matrix of the present sets without what single rows say, by rows, into LU. */
 void softgrasp_matrix(Rub *f) {
   const int s = 1 + f->m, K = f->k * s;
-  double *v = f->room, *v2 = v + K;
+  double *v = f->room, *row = v + K;
   memcpy(f->kind0, f->kind, f->k * sizeof(int));
   memcpy(f->e0, f->e, (size_t)f->k * s * sizeof(double));
   f->rows = K;
@@ -82,46 +107,12 @@ void softgrasp_matrix(Rub *f) {
   for (int i = 0; i < f->k; i++) f->size += f->kind[i] == OPEN ? 0 : f->kind[i] == STICK ? s : f->m;
   for (int i = 0, r = 0; i < f->k; i++)
     for (int a = 0; a < (f->kind[i] == OPEN ? 0 : f->kind[i] == STICK ? s : f->m); a++, r++) {
-      const double *e = f->e + i * s;
-      row_of(f, i, a, f->kind[i], e, v);
-      if (a > 0 && f->kind[i] == SLIP) { /* across e alone */
-        row_of(f, i, 2, SLIP, e, v2);
-        for (int j = 0; j < K; j++) v[j] = e[0] * v2[j] - e[1] * v[j];
-      }
-      shorten(f, v, f->LU + r, f->size);
+      if (a > 0 && f->kind[i] == SLIP) across(f, i, f->e + i * s, v);
+      else row_of(f, i, a, f->kind[i], f->e + i * s, v);
+      if (f->single && (a == 0 || f->kind[i] == STICK)) v[i * s + a] *= 1 + RIDGE_SINGLE;
+      shorten(f, v, f->single ? row : f->LU + (size_t)r * f->size);
+      for (int j = 0; f->single && j < f->size; j++) f->LU_single[(size_t)r * f->size + j] = (float)row[j];
     }
-}
-
-/* b <- LU^-1 b. */
-static void factor_back(const Rub *f, double *restrict b) {
-  const int K = f->size;
-  for (int j = 0; j < K; j++) {
-    const double t = b[f->pivot[j]];
-    b[f->pivot[j]] = b[j];
-    b[j] = t;
-  }
-  int j = 0;
-  for (; j + 4 <= K; j += 4) { /* four columns in a pass */
-    const double *l = f->LU + (size_t)j * K, *l1 = l + K, *l2 = l1 + K, *l3 = l2 + K, t0 = b[j];
-    const double t1 = b[j + 1] -= l[j + 1] * t0;
-    const double t2 = b[j + 2] -= l[j + 2] * t0 + l1[j + 2] * t1;
-    const double t3 = b[j + 3] -= l[j + 3] * t0 + l1[j + 3] * t1 + l2[j + 3] * t2;
-    for (int i = j + 4; i < K; i++) b[i] -= (l[i] * t0 + l1[i] * t1) + (l2[i] * t2 + l3[i] * t3);
-  }
-  for (; j < K; j++)
-    for (int i = j + 1; i < K; i++) b[i] -= f->LU[(size_t)j * K + i] * b[j];
-  for (j = K; j > K / 4 * 4;) {
-    const double *u = f->LU + (size_t)--j * K, t = b[j] /= u[j];
-    for (int i = 0; i < j; i++) b[i] -= u[i] * t;
-  }
-  while (j > 0) {
-    j -= 4;
-    const double *u = f->LU + (size_t)j * K, *u1 = u + K, *u2 = u1 + K, *u3 = u2 + K, t3 = b[j + 3] /= u3[j + 3];
-    const double t2 = b[j + 2] = (b[j + 2] - u3[j + 2] * t3) / u2[j + 2];
-    const double t1 = b[j + 1] = (b[j + 1] - u3[j + 1] * t3 - u2[j + 1] * t2) / u1[j + 1];
-    const double t0 = b[j] = (b[j] - u3[j] * t3 - u2[j] * t2 - u1[j] * t1) / u[j];
-    for (int i = 0; i < j; i++) b[i] -= (u[i] * t0 + u1[i] * t1) + (u2[i] * t2 + u3[i] * t3);
-  }
 }
 
 /* b <- J^-1 b for the J that the factor is of. Rows of open nodes, and those of slipping nodes along e, say what they are
@@ -129,6 +120,7 @@ static void factor_back(const Rub *f, double *restrict b) {
 static void back(const Rub *f, double *restrict b) {
   const int s = 1 + f->m, K = f->rows;
   double *g = f->room + 3 * K + f->most, *c = g + K, *known = c + K;
+  float *low = (float *)g;
   int some = 0, r = 0;
   memset(g, 0, K * sizeof(double));
   memset(known, 0, K * sizeof(double));
@@ -155,7 +147,13 @@ static void back(const Rub *f, double *restrict b) {
       for (int a = 1; a < s; a++) c[r++] = h[a] - G[a];
     else if (f->m > 1) c[r++] = e[0] * h[2] - e[1] * h[1] - e[2] * (e[0] * G[2] - e[1] * G[1]);
   }
-  factor_back(f, c);
+  if (f->single) {
+    for (int j = 0; j < f->size; j++) low[j] = (float)c[j];
+    back_in_float(f->size, f->LU_single, f->pivot, low);
+    for (int j = 0; j < f->size; j++) c[j] = low[j];
+  } else {
+    back_in_double(f->size, f->LU, f->pivot, c);
+  }
   r = 0;
   for (int i = 0; i < f->k; i++) {
     const double *e = f->e0 + i * s, *own = known + i * s;

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles import HalfSpace
-from softgrasp.fem.obstacles.compiled import BALANCE, DONE, ENTER, SOLVE, TAKE, UNSETTLED, contact_library
+from softgrasp.fem.obstacles.compiled import BALANCE, DONE, ENTER, KINDS, SOLVE, TAKE, UNSETTLED, contact_library
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.contact.general import MOST, ROUNDING, STILL, Contact, unsettled
 from softgrasp.fem.run.contact.rows import Ints, Rows
@@ -24,10 +24,6 @@ from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import Driven
 
-KINDS = {
-    np.dtype(float): "double[]", np.dtype(np.intc): "int[]", np.dtype(bool): "char[]", np.dtype(np.int64): "long[]",
-}  # fmt: skip
-"""Types in C."""
 READS = 2  # of every entry of the factor by a solve
 
 
