@@ -12,7 +12,7 @@ from mpi4py import MPI
 from softgrasp.fem.checksums import read_manifest, write_manifest
 from softgrasp.fem.errors import CheckpointError, Paused, SceneError, SolverError
 from softgrasp.fem.model.build import build
-from softgrasp.fem.obstacles.coulomb import SINGLE, Coulomb
+from softgrasp.fem.obstacles.coulomb import Coulomb
 from softgrasp.fem.obstacles.lemke import pyramid_forces
 from softgrasp.fem.run.checkpoint import FORMAT
 from softgrasp.fem.run.contact.friction import FlatFriction
@@ -172,21 +172,6 @@ def test_few_other_rows_leave_the_factor() -> None:
         assert np.abs(x - fresh).max() < 1e-11 * np.abs(fresh).max(), step  # condition number 1e2
     assert max(others) > 0
     assert len(factored) < 15
-
-
-@pytest.mark.parametrize("twice", [False, True])
-def test_factors_in_single_precision_lead_to_forces_in_double(twice: bool) -> None:
-    """Also where every node meets two equal tables, so that W is singular and its factor rounding alone."""
-    rng, k = np.random.default_rng(3), 2 * (SINGLE // 2 + 5)
-    m = k // 2 if twice else k
-    A, q = rng.standard_normal((3 * m + 2, 3 * m)), rng.standard_normal(3 * m) - 0.5
-    W = A.T @ A / m + 0.5 * np.eye(3 * m)
-    if twice:
-        W, q = np.ascontiguousarray(np.tile(W, (2, 2))), np.tile(q, 2)
-    coulomb, mu = Coulomb(2, "C"), np.full(k, 0.3)
-    for load in (q, 0.9 * q + 0.01):
-        check_law(coulomb.solve(k, W, load, mu, 1e-13), W, load, 0.3)
-    assert twice or coulomb.f.single
 
 
 def test_sliding_starts_at_mu_times_the_weight() -> None:
