@@ -133,7 +133,8 @@ class ReducedModel(Shown):
         Returns:
             :class:`softgrasp.study.notebook.View`: ``save("pull.html")`` writes it; empty on a rank above 0.
 
-        Raises ModelError: the basis does not keep the hand apart, or the model is unstable or without its basis.
+        Raises ModelError: the scene is another one, the basis does not keep the hand apart, or the model is unstable or
+            without its basis.
         """
         return drawn("pulled", self, model)
 

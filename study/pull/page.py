@@ -12,6 +12,7 @@ from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
 from softgrasp.fem.shown import length_unit
 from softgrasp.reduction.bases.registry import METHODS
 from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.origin import check_origin
 from softgrasp.reduction.propagator import Propagator, propagator
 from softgrasp.reduction.system import ModelError
 from softgrasp.study.pictures import shapes
@@ -34,9 +35,10 @@ def pull_page(rom: ReducedModel, model: Model, dt: float | None = None) -> str:
         model: scene that it was made of, with its mesh.
         dt: time step [s]; None: that of the scene, no longer than from one picture to the next.
 
-    Raises ModelError: the hand is inside the basis, the model is unstable or was loaded without its basis, or the
-        shapes are more than a page may hold.
+    Raises ModelError: the scene differs in more than materials and motion, the hand is inside the basis, the model is
+        unstable or was loaded without its basis, or the shapes are more than a page may hold.
     """
+    check_origin(rom.origin, model.scene_keys, rom.name)
     small = rom.at(model.system.materials)
     if not small.stable:
         raise ModelError("an unstable model has no page to pull at; use another N or basis", rom.name)

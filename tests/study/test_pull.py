@@ -101,6 +101,9 @@ def test_models_that_cannot_be_pulled_are_refused(monkeypatch: pytest.MonkeyPatc
         whole.pull(model)
     rom = sg.reduce(model, run, "craig_bampton", N=14)
     assert isinstance(rom, ReducedModel)
+    for other in ({"tissue": {"cells": [3, 6]}}, {"effects": {"gravity": [0.0, -2.0]}}):
+        with pytest.raises(ModelError, match=r"was built with .* reduce that scene itself"):
+            rom.pull(sg.build("paper_lqr", **{**SCENES["paper_lqr"], **other}))
     monkeypatch.setattr("softgrasp.study.pull.page.MOST_BYTES", 1000)
     with pytest.raises(ModelError, match="MB of shapes, more than 0; use a coarser mesh"):
         rom.pull(model)
