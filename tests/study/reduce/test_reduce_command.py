@@ -100,6 +100,8 @@ def test_command_writes_what_design_promises(mpi_tmp_path: Path, small: FullRun)
         for name in ("errors", "errors_beyond", "times", "sigma", "modes", "compare"):
             assert (mpi_tmp_path / f"{name}.png").stat().st_size > 5000, name
         assert (mpi_tmp_path / "compare.gif").stat().st_size > 5000
+        assert "linear elasticity" in (mpi_tmp_path / "pull.html").read_text()
+        assert 'href="pull.html"' in (mpi_tmp_path / "report.html").read_text()
         if MPI.COMM_WORLD.size == 1 and find_chromium():
             assert look(mpi_tmp_path / "report.html", figures=8) == []
         for words in ("PSD complex SVD, fixed", "Break-even mesh", "N counts all columns of V", "x new"):
