@@ -70,7 +70,7 @@ def shipped_scenes() -> dict[str, Path]:
 def find_scene(path: str | Path) -> Path:
     """The scene that ships under a bare name, else the file of that path."""
     file = Path(path)
-    bare = len(file.parts) == 1 and not os.path.exists(file)  # false for a name that is too long, which Path raises
+    bare = len(file.parts) == 1 and not os.path.isfile(file)  # false for a name that is too long, which Path raises
     return shipped_scenes().get(file.name, file) if bare else file
 
 

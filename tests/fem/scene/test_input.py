@@ -195,3 +195,9 @@ def test_a_long_sentence_keeps_its_ends() -> None:
 )
 def test_hint_for_a_key_that_others_use(override: str, text: str) -> None:
     assert text in sentence(lambda: load_scene(shipped_scenes()["layers_2d"], [override]))
+
+
+def test_a_folder_of_its_name_does_not_hide_a_shipped_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "set_down").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert load_scene("set_down").name == "set_down"
