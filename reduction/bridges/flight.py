@@ -85,6 +85,7 @@ class FreeFlight:
         self._P, self._L, self._arm = R @ p[:3], R @ (p[3:] - np.cross(c, p[:3])), R @ c
         self._x, self._R, self._w = data.qpos[self._at][:3] + self._arm, R, v[3:].copy()
         self._q = data.qpos[self._at][3:].copy()
+        self._mujoco.mju_normalize4(self._q)
 
     def keep(self, data: Any, h: float, gravity: Array, inertia: Array, moving: Array, given: Array) -> None:
         """Set velocity, axes and place of the root after a step in which the tissue gave ``given`` (nv,)."""

@@ -199,7 +199,8 @@ void softgrasp_tissue_depart(const Tissue *t) {
   momenta(t, mass, p, c);
   memcpy(was + 12, t->R, 9 * sizeof(double));
   memcpy(was + 21, v + 3, 3 * sizeof(double));
-  memcpy(was + 24, place + 3, 4 * sizeof(double));
+  const double length = sqrt(dot(4, place + 3, place + 3));
+  for (int i = 0; i < 4; i++) was[24 + i] = length > 1e-15 ? place[3 + i] / length : i == 0; /* as MuJoCo */
   against(t->R, v, own);
   memcpy(own + 3, v + 3, 3 * sizeof(double));
   for (int i = 0; i < 6; i++) p[i] += dot(6, mass + 6 * i, own);
