@@ -14,8 +14,8 @@ from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.plant.block import Block
 
-# Shifts nearer to each other, in parts of the larger one, are solved with in turn: of two that are solved with side by
-# side the second solution loses the digits of their relative distance.
+# Of shifts that are solved with side by side a later solution loses the digits of its distance, in parts of the larger
+# shift, from each one before it: where the product of these distances is less, shifts are solved with in turn.
 APART = 0.05
 
 
@@ -141,7 +141,7 @@ def open_adjoints(plant: Plant, tissue: ShiftedTissue, shifts: Sequence[complex]
     """
     n = plant.n_local
     shifts = [complex(p) for p in shifts]
-    count = min(tissue.group(shifts), _apart(shifts))
+    count = min(tissue.group(shifts), far_apart(shifts))
     rights = [np.asarray(p * W.tall[n : 2 * n] - W.tall[:n], dtype=complex) for p in shifts[:count]]
     if plant.two_way:
         rights = [np.hstack([F, plant.G]) for F in rights]
@@ -149,10 +149,10 @@ def open_adjoints(plant: Plant, tissue: ShiftedTissue, shifts: Sequence[complex]
     return [_with_hand(plant, p, W, np.ascontiguousarray(b)) for p, b in zip(shifts, answers, strict=False)]
 
 
-def _apart(shifts: list[complex]) -> int:
+def far_apart(shifts: Sequence[complex]) -> int:
     """How many of the first shifts lie so far apart that :meth:`OpenSolution.moved` keeps its digits."""
     for i, q in enumerate(shifts):
-        if any(abs(q - p) < APART * max(abs(p), abs(q)) for p in shifts[:i]):
+        if np.prod([min(1.0, abs(q - p) / max(abs(p), abs(q))) for p in shifts[:i]]) < APART:
             return i
     return len(shifts)
 

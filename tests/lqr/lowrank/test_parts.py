@@ -14,7 +14,7 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.dense.modal import relative_space
-from softgrasp.lqr.lowrank.adjoint import adjoint_rhs, closed_adjoint, mass_rhs, open_adjoints
+from softgrasp.lqr.lowrank.adjoint import adjoint_rhs, closed_adjoint, far_apart, mass_rhs, open_adjoints
 from softgrasp.lqr.lowrank.compress import compress
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin, frequencies
 from softgrasp.lqr.lowrank.modal_start import modal_start, plant_modes
@@ -73,6 +73,8 @@ def test_solution_beside_another_shift_is_that_of_the_new_right_hand_side(name: 
     together = open_adjoints(plant, solver, shifts, right)
     assert len(together) == min(layout.comm.size, 3)
     assert len(open_adjoints(plant, solver, [-1.0, -1.01, -9.0], right)) == 1  # too near
+    assert far_apart([-1.0, -1.06, -1.12, -9.0]) == 2  # 0.057 * 0.11 < APART
+    assert far_apart(shifts) == 3
     first, *others = [open_adjoints(plant, solver, [p], right)[0] for p in shifts]
     V = closed_adjoint(plant, first, right)
     new = right.plus(mass_rhs(plant, V.real(coefficients)), small)
