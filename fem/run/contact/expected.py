@@ -64,8 +64,8 @@ def expected_contact(model: Model, n: int | None = None) -> ExpectedContact | No
     straight = [isinstance(o.shape, HalfSpace) and not e.friction for o, e in zip(obstacles, entries, strict=True)]
     finer = ((n or layout.n_e) / layout.n_e) ** ((d - 1) / d)
     columns = int(touching.sum(axis=1) @ np.where(straight, 1, d))
-    sizes = int(touching.any(axis=0).sum()), columns, surface.X.size
-    return ExpectedContact(*(round(finer * size) for size in sizes), d)
+    nodes = int(touching.any(axis=0).sum())
+    return ExpectedContact(round(finer * nodes), round(finer * columns), round(finer * surface.X.size), d)
 
 
 def nearest_gaps(
