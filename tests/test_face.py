@@ -40,7 +40,7 @@ def test_import_loads_neither_mpi_nor_dolfinx() -> None:
 
 @pytest.mark.parametrize(("given", "threads"), [(None, 1), ("2", 2)])
 def test_numpy_loaded_before_gets_one_thread_unless_the_user_asks_for_more(given: str | None, threads: int) -> None:
-    """A small model on several threads takes up to six times the processor time; threadpoolctl counts them."""
+    """A small model on several threads takes three to seven times the processor time; threadpoolctl counts them."""
     pytest.importorskip("threadpoolctl")
     if (os.cpu_count() or 1) < threads:
         pytest.skip("one core")
