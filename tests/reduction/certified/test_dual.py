@@ -101,6 +101,8 @@ def test_a_file_keeps_the_duals(comm: MPI.Intracomm, mpi_tmp_path: Any) -> None:
     again = load_certified(mpi_tmp_path / "duals.h5")
     one, two = (m.run(allow=True) for m in (certified, again))
     assert two.certificate.sentence() in repr(two)
+    assert len(repr(certified)) < 1000
+    assert "<tr>" in certified._repr_html_()
     assert len(repr(two.certificate)) < 300
     assert all(value in repr(two.certificate) for value in re.findall(r"[\d.]+ %", two.certificate.sentence()))
     a, b = one.certificate.outputs.values, two.certificate.outputs.values
