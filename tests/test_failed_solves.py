@@ -115,7 +115,7 @@ def shift(**calls: Callable[..., Any]) -> Callable[[Patch], None]:
 def shifted_solve(patch: Patch) -> None:
     tissue = shifted.DistributedTissue(plant().system)
     patch.setattr(shifted, "direct_solves", lambda _: Failing(matSolve=broken))
-    tissue._solve(2j, np.ones((tissue.n_local, 1)))
+    tissue._solve_each([2j], [np.ones((tissue.n_local, 1))])
 
 
 def spectrum(patch: Patch) -> None:

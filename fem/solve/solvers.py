@@ -138,12 +138,13 @@ class TissueSolver:
             return
         solve_checked(self.ksp, r, w, self.name)
 
-    def columns(self, X: Array, where: str = "") -> Array:
+    def columns(self, X: Array, where: str = "", room: tuple[PETSc.Vec, PETSc.Vec] | None = None) -> Array:
         """S^-1 X of local rows (n_local, k), Fortran order; checked as :meth:`check` does if ``where`` is given.
 
-        Columns of zeros are not solved. Collective.
+        Columns of zeros are not solved. ``room``: two vectors of the caller's for single columns, which are made
+        otherwise. Collective.
         """
-        r, w = self.S.createVecs()
+        r, w = room or self.S.createVecs()
         result = np.zeros(X.shape, order="F")
         some = np.flatnonzero(total(self.S.comm.tompi4py(), np.abs(X).sum(axis=0)) != 0)
         block = None
@@ -163,8 +164,9 @@ class TissueSolver:
                 if where:
                     self.check(r, w, where)
         finally:
-            r.destroy()
-            w.destroy()
+            if room is None:
+                r.destroy()
+                w.destroy()
         return result
 
     def residual(self, r: PETSc.Vec, w: PETSc.Vec, size: float = 0.0) -> float:

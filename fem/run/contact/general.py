@@ -115,7 +115,7 @@ class Contact:
         b = np.zeros((len(self.b.array_r), forces.shape[1]), order="F")
         for j, force in enumerate(forces.T):
             b[self.places, j] = self.surface.on_nodes(force)[self.order]
-        columns = self.midpoint.solver.columns(b)
+        columns = self.midpoint.solver.columns(b, room=(self.b, self.y))
         return columns, np.column_stack([self._take(column) for column in columns.T])
 
     def _take(self, x: Array) -> Array:
