@@ -141,8 +141,7 @@ class TissueSolver:
     def columns(self, X: Array, where: str = "", room: tuple[PETSc.Vec, PETSc.Vec] | None = None) -> Array:
         """S^-1 X of local rows (n_local, k), Fortran order; checked as :meth:`check` does if ``where`` is given.
 
-        Columns of zeros are not solved. ``room``: two vectors of the caller's for single columns, which are made
-        otherwise. Collective.
+        Columns of zeros are not solved. ``room``: vectors for single columns; None: they are made. Collective.
         """
         r, w = room or self.S.createVecs()
         result = np.zeros(X.shape, order="F")
@@ -164,9 +163,8 @@ class TissueSolver:
                 if where:
                     self.check(r, w, where)
         finally:
-            if room is None:
-                r.destroy()
-                w.destroy()
+            for vector in () if room else (r, w):
+                vector.destroy()
         return result
 
     def residual(self, r: PETSc.Vec, w: PETSc.Vec, size: float = 0.0) -> float:
