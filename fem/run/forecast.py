@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import psutil
@@ -15,10 +16,12 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.memory import factor_bytes, free_bytes, need, steps_of
 from softgrasp.fem.resources import size_text
-from softgrasp.fem.run.contact.expected import ExpectedContact, expected_contact
 from softgrasp.fem.run.frames import frame_count
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.costs import BUILD, ENTRIES, ITERATIVE, SolverName, seams
+
+if TYPE_CHECKING:
+    from softgrasp.fem.run.contact.expected import ExpectedContact
 
 TYPICAL, WORST = 1.3, 2.6  # factors of `python -m benchmarks scale`, the geometric mean and the largest, of whole runs
 START = 3.0  # time of every command: imports, page and pictures of a small run [s]
@@ -110,7 +113,11 @@ def forecasts(model: Model, n_e: int | None = None, cells: int | None = None) ->
     comm, cores = layout.comm, psutil.cpu_count(logical=False) or 1
     free = comm.allreduce(free_bytes(scene), MPI.MIN)
     n, simplices = n_e or layout.n_e, cells or model.cells
-    counts, touching = sorted({*RANKS, comm.size}), expected_contact(model, n)
+    counts, touching = sorted({*RANKS, comm.size}), None
+    if scene.effects.obstacles:  # only scenes with contact pay for it
+        from softgrasp.fem.run.contact.expected import expected_contact
+
+        touching = expected_contact(model, n)
     return tuple(
         forecast(scene, n, layout.dimension, simplices, ranks, free * -(-ranks // cores), touching) for ranks in counts
     )

@@ -28,7 +28,6 @@ EXACT = 1e-9  # a well conditioned direct solve leaves a drift of 1e-16 to 1e-12
 ITERATED = 1e-3  # residual of an iterated step, or estimated error of all, up to which nothing is said
 LOOKED_AT = 25  # stored instants that strain and frequency are taken from,
 LARGEST = 4_000_000  # fewer where they would be more numbers than this: their products need as much again
-PATH_INSTANTS = 200  # instants of a prescribed motion at which the gap to obstacles is computed
 OVERSHOOT = 2.0  # largest response of an undamped mode to a sudden load, over the static one
 
 
@@ -111,20 +110,19 @@ def _nodes_alone(entries: list[Obstacle], order: int, d: int, longest: float) ->
 def out_of_reach(model: Model, strain: float, length: float) -> list[str]:
     """Obstacles that a body which moves with the hand stays clear of by more than it deforms. Collective.
 
-    The gap is that of its boundary nodes at `PATH_INSTANTS` instants of a prescribed motion, and the deformation is
-    estimated as `OVERSHOOT` times ``strain``, the static rms gradient under the largest load [1], times ``length`` [m].
+    The gap is that of its boundary nodes at some instants of a prescribed motion, and the deformation is estimated as
+    `OVERSHOOT` times ``strain``, the static rms gradient under the largest load [1], times ``length`` [m].
     """
     scene, system = model.scene, model.system
     if not scene.effects.obstacles or scene.motion.drive == "force":
         return []
     from softgrasp.fem.model.surface import make_surface  # only scenes with contact pay for it
     from softgrasp.fem.obstacles import make_obstacles
+    from softgrasp.fem.run.contact.expected import nearest_gaps
 
     surface, q = make_surface(model.space, system), motion_table(scene, system.layout.n_s).q
-    instants, dt = spread(len(q), PATH_INSTANTS).tolist(), scene.time_end / scene.time.steps
     obstacles = make_obstacles(scene, system.layout.dimension)
-    places = ((n * dt, surface.places(q[n])) for n in instants)
-    gap = min(float(o.gap(x, t).min()) for t, x in places for o in obstacles)
+    gap = float(nearest_gaps(surface, obstacles, q, scene.time_end / scene.time.steps).min())
     margin = OVERSHOOT * strain * length
     if gap <= margin:
         return []
