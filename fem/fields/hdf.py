@@ -46,23 +46,9 @@ class HdfWriter(SeriesWriter):
         self.stem, self.run = name, run
         self.files: dict[str, Path] = {}
 
-    def write(
-        self,
-        t: float,
-        z: Array,
-        v: Array,
-        q_s: Array,
-        v_s: Array | None = None,
-        *,
-        traction: Array | None = None,
-        reserve: int = 0,
-    ) -> None:
-        """See :meth:`SeriesWriter.write`. Collective."""
+    def _store(self, t: float, points: list[Field], cells: list[Field], q_s: Array, reserve: int) -> None:
         import dolfinx.io.vtkhdf as io  # only these files need it
 
-        points, cells = self._fields(z, v, q_s, v_s)
-        if traction is not None:
-            points.append(Field("contact_traction", "Pa", self._points(traction)))
         fields = [(io.write_point_data, f) for f in points] + [(io.write_cell_data, f) for f in cells]
         fields = [(write, f) for write, f in fields if f.unit]  # zone and layer stay as they are
         needed = 8 * sum(field.values.size for _, field in fields)  # in double precision, whatever is given
@@ -74,7 +60,6 @@ class HdfWriter(SeriesWriter):
                 write(path, self.mesh, np.ascontiguousarray(field.values).ravel(), t)
             except RuntimeError as error:
                 raise OSError(f"{path}: {error}") from error
-        self.written += 1
 
     def _begin_file(self, name: str) -> Path:
         """A file with the mesh alone. Collective."""

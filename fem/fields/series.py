@@ -86,6 +86,11 @@ class SeriesWriter:
         points, cells = self._fields(z, v, q_s, v_s)
         if traction is not None:
             points.append(Field("contact_traction", "Pa", self._points(traction)))
+        self._store(t, points, cells, q_s, reserve)
+        self.written += 1
+
+    def _store(self, t: float, points: list[Field], cells: list[Field], q_s: Array, reserve: int) -> None:
+        """Write the fields of an instant. Collective."""
         whole = [Field("TimeValue", "s", np.array([t])), Field("hand", "m", np.asarray(q_s, dtype=np.float64))]
         fields = [*points, *cells, *(field for part in self.grid.fields().values() for field in part)]
         needed = self.comm.reduce(sum(field.values.nbytes for field in fields)) or 0  # one file, by rank 0
@@ -95,7 +100,6 @@ class SeriesWriter:
         check_room(self.comm, [path], needed, reserve)
         checks = write_vtu(self.comm, path, self.grid, points, cells, whole)
         on_root(self.comm, lambda: self.list.add(t, path, checks))
-        self.written += 1
 
     def _begin(self) -> None:
         """Make the folder and the list; rank 0 only."""
