@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from softgrasp.fem import Array, Model, PictureMesh
 from softgrasp.fem.errors import raise_on_all_ranks
@@ -46,7 +48,11 @@ def pull_page(rom: ReducedModel, model: Model, dt: float | None = None) -> str:
     slower = 1 / shapes.speed_up(np.array([0.0, end]))
     step = propagator(small, dt or min(end / model.scene.time.steps, FRAME / slower), driven=True)
     start = step.at.X_inverse @ small.equilibrium()[2 * small.n_s :]
-    shown, picture, page = shapes_of(rom, model, step), gather_picture(model), ""
+    picture, page = gather_picture(model), ""
+    with raise_on_all_ranks(model.system.layout.comm):  # before the shapes, which cost the work
+        if picture is not None:
+            _check_size(picture, 2 * small.n_s + step.size, rom.name)
+    shown = shapes_of(rom, model, step)
     with raise_on_all_ranks(model.system.layout.comm):
         if picture is not None and shown is not None:
             page = _page(rom, picture, step, start, shown, slower)
@@ -63,18 +69,26 @@ def shapes_of(rom: ReducedModel, model: Model, step: Propagator) -> Array | None
     return vertex_displacement(model, z, np.zeros((model.system.layout.n_s, coordinates.shape[1])))
 
 
+def _faces(picture: PictureMesh) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Vertices that are drawn, and the triangles in their numbers."""
+    return np.unique(picture.cells if picture.dimension == 2 else picture.facets, return_inverse=True)
+
+
+def _check_size(picture: PictureMesh, columns: int, name: str) -> None:
+    size = 4.0 * 3 * len(_faces(picture)[0]) * columns
+    if size > MOST_BYTES:
+        raise ModelError(
+            f"a page to pull at would hold {size / 1e6:.0f} MB of shapes, more than {MOST_BYTES / 1e6:.0f}; use a "
+            "coarser mesh",
+            name,
+        )
+
+
 def _page(rom: ReducedModel, picture: PictureMesh, step: Propagator, start: Array, shown: Array, slower: float) -> str:
     flat, d = picture.dimension == 2, picture.dimension
-    faces = picture.cells if flat else picture.facets
-    used, triangles = np.unique(faces, return_inverse=True)
+    used, triangles = _faces(picture)
     points = np.pad(picture.points[used], ((0, 0), (0, 3 - d)))
     U = np.pad(shown[:, used], ((0, 0), (0, 0), (0, 3 - d))).transpose(1, 2, 0)
-    if U.size * 4 > MOST_BYTES:
-        raise ModelError(
-            f"a page to pull at would hold {U.size * 4 / 1e6:.0f} MB of shapes, more than {MOST_BYTES / 1e6:.0f}; "
-            "use a coarser mesh",
-            rom.name,
-        )
     across = float(np.linalg.norm(np.ptp(points, axis=0)))
     (factor, unit), (place_factor, place_unit) = length_unit(WIDE / 4 * across), length_unit(across)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
