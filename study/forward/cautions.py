@@ -67,8 +67,11 @@ def turned(angle: float) -> list[str]:
     ]
 
 
-def small_obstacles(model: Model) -> list[str]:
-    """Obstacles that contact can miss between two boundary nodes. Collective."""
+def small_obstacles(model: Model, finer: float = 1.0) -> list[str]:
+    """Obstacles that contact can miss between two boundary nodes. Collective.
+
+    ``finer``: edges of the cells over those of the model.
+    """
     if not model.scene.effects.obstacles:
         return []
     from softgrasp.fem.model.surface import node_distance  # only scenes with contact pay for it
@@ -76,7 +79,7 @@ def small_obstacles(model: Model) -> list[str]:
     from softgrasp.fem.obstacles.spacing import edge_parts
 
     layout, entries = model.system.layout, model.scene.obstacle or []
-    longest = node_distance(model.space) * layout.order
+    longest = finer * node_distance(model.space) * layout.order
     parts = edge_parts(entries, layout.order, layout.dimension)
     divided = 1 if parts is None else int(parts(np.array([longest]))[0])
     between, what = longest / max(divided, layout.order), "nodes" if divided == 1 else "points"

@@ -167,24 +167,26 @@ def explain_model(model: Model) -> Explanation:
 
 
 def unknowns_of(scene: Scene) -> int:
-    """Unknowns of the lattice of a box of even cells, those of the contact zone included; 0 for other scenes.
+    """Unknowns of the lattice of a box, those of the contact zone included; 0 for other scenes.
 
-    Scenes are others too where an obstacle or a plan asks for the boundary nodes of the mesh itself.
+    Scenes are others too where a tolerance chooses the cells, and where a plan asks for the nodes of the mesh itself.
     """
-    tissue, control = scene.tissue, scene.control
+    tissue, control, refine = scene.tissue, scene.control, scene.tissue.refine
     planned = control is not None and control.constraints is not None
-    if not tissue.cells or tissue.refine is not None or scene._given is not None:
+    if not tissue.cells or scene._given is not None or planned:
         return 0
-    return 0 if scene.effects.obstacles or planned else _lattice(scene) * len(tissue.cells)
+    n = _lattice(scene) * len(tissue.cells)
+    lines = refine is None or (by_lines(scene) and refine.tolerance is None and n <= refine.most)
+    return n if lines else 0
 
 
 def _lattice(scene: Scene) -> int:
-    """Nodes of a box of even cells."""
+    """Nodes of a box, whose lines may crowd."""
     return math.prod(scene.tissue.order * n + 1 for n in scene.tissue.cells or [])
 
 
 def _pairs(scene: Scene) -> int:
-    """Pairs of nodes of a box of even simplices that share one, (i, j) and (j, i), those of a node with itself too."""
+    """Pairs of nodes of a box of simplices that share one, (i, j) and (j, i), those of a node with itself too."""
     sides = [scene.tissue.order * n + 1 for n in scene.tissue.cells or []]
     steps = product((0, 1), repeat=len(sides))
     return 2 * sum(math.prod(n - o for n, o in zip(sides, step, strict=True)) for step in steps) - math.prod(sides)
@@ -254,7 +256,7 @@ def _explained(scene: Scene, looked: Model, sizes: ModelSizes, model: Model | No
         warnings=(
             *(looked if model is None else model).space.mesh.notes,
             *_warnings(scene, poisson, omega, dt, d, reports, problem.sag),
-            *([] if model is None else small_obstacles(model)),
+            *small_obstacles(looked if model is None else model, _shrunk(scene, looked) if model is None else 1.0),
             *out_of_reach(looked, problem.response.rms, problem.length),
         ),
         outputs=output_places(looked if model is None else model),
@@ -268,6 +270,12 @@ def _explained(scene: Scene, looked: Model, sizes: ModelSizes, model: Model | No
         dimension=d,
         plan=None if model is None else _plan(model),
     )
+
+
+def _shrunk(scene: Scene, copy: Model) -> float:
+    """Edges of the cells of a box over those of its copy, the largest ratio of all directions [1]."""
+    pairs = zip(copy.scene.tissue.cells or [], scene.tissue.cells or [], strict=True)
+    return max(few / many for few, many in pairs)
 
 
 def _plan(model: Model) -> PlanSizes | None:

@@ -308,6 +308,8 @@ def test_a_large_scene_is_explained_by_coarser_cells(
     [
         ("paper_forward", ["tissue.order=2"], "tissue.cells=[40,80]"),
         ("block_3d", ["tissue.order=1", "tissue.refine=false"], "tissue.cells=[10,9,17]"),
+        ("block_3d", ["tissue.order=1"], "tissue.cells=[10,9,17]"),  # lines that crowd
+        ("push_disc", ["obstacle.0.friction=0.3", "obstacle.0.radius=1e-4"], "tissue.cells=[40,80]"),
     ],
 )
 def test_a_box_too_large_to_build_is_explained_by_computed_sizes(
@@ -325,6 +327,7 @@ def test_a_box_too_large_to_build_is_explained_by_computed_sizes(
     assert computed.sizes.nonzeros == pytest.approx(own.sizes.nonzeros, rel=0.02)  # as above, in two digits
     assert (computed.time, computed.sag, computed.effects) == (own.time, own.sag, own.effects)
     assert computed.mesh.shift is None
+    assert computed.warnings == own.warnings
     said = io.StringIO()
     show_sections(Console(file=said, width=300), sections(computed))
     assert f"n_e = about {computed.sizes.n_e}" in said.getvalue()
@@ -333,8 +336,11 @@ def test_a_box_too_large_to_build_is_explained_by_computed_sizes(
 
 
 def test_scenes_that_need_their_own_mesh_are_built() -> None:
-    """Graded cells, and obstacles, which ask for the distance of boundary nodes."""
+    """Cells that a tolerance chooses, more unknowns than are allowed, and plans, which ask for boundary nodes."""
     cells = "tissue.cells=[400,800]"
     assert unknowns_of(load_scene("paper_forward", [cells])) == 2 * 401 * 801
+    assert unknowns_of(load_scene("paper_forward", [cells, "tissue.refine={most=700000}"])) == 2 * 401 * 801
     assert unknowns_of(load_scene("paper_forward", [cells, "tissue.refine={}"])) == 0
-    assert unknowns_of(load_scene("push_disc", [cells])) == 0
+    assert unknowns_of(load_scene("paper_forward", [cells, "tissue.refine={most=700000,tolerance=0.01}"])) == 0
+    assert unknowns_of(load_scene("paper_forward", [cells, "tissue.refine={most=700000,method='bisect'}"])) == 0
+    assert unknowns_of(load_scene("paper_obstacle", [cells])) == 0
