@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.energy import exact_energy
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 
 if TYPE_CHECKING:
@@ -46,14 +47,21 @@ class Ledger:
 
     def start(self, state: TissueState) -> None:
         """Keep the energy of the first state. Collective."""
-        self.first = self.midpoint.energy(state)
-        self.peak = abs(self.first)
+        self.first = self._energy(state)
+        self.sample(state)
 
     def sample(self, state: TissueState) -> float:
         """Energy of a state, for the scale of the drift [J]. Collective."""
         energy = self.midpoint.energy(state)
         self.peak = max(self.peak, abs(energy))
         return energy
+
+    def _energy(self, state: TissueState) -> float:
+        """Energy of a state to as many digits as there are [J]. Collective."""
+        system = self.midpoint.system
+        if system.points is None and system.frame is None:
+            return exact_energy(self.midpoint, state)
+        return self.midpoint.energy(state)
 
     def balance(self, n: int) -> tuple[float, float]:
         """Work of loads and contact, and energy dissipated, from the start to step n, the last [J]. Collective."""
@@ -64,7 +72,7 @@ class Ledger:
     def drift(self, state: TissueState, n: int) -> float:
         """Energy at step n that neither load nor damping explains, over the largest energy seen. Collective."""
         work, lost = self.balance(n)
-        defect = self.midpoint.energy(state) - self.first - work + lost
+        defect = self._energy(state) - self.first - work + lost
         scale = max(self.peak, abs(work), abs(lost))
         return abs(defect) / scale if scale > 0 else 0.0
 
