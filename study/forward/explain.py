@@ -38,6 +38,7 @@ from softgrasp.fem.model.memory import (
 from softgrasp.fem.model.refined import by_lines, scene_ends
 from softgrasp.fem.model.scales import measure
 from softgrasp.fem.run.forecast import Forecast, forecasts
+from softgrasp.fem.solve.costs import BUILD
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT
 from softgrasp.study.forward.accuracy import estimate_error
 from softgrasp.study.forward.cautions import (
@@ -58,9 +59,9 @@ if TYPE_CHECKING:  # plans are not imported where a scene asks for none
 
 MODES = 6
 MOST_LOOKED_AT = {2: 20_000, 3: 6_000}  # unknowns that modes and sag are computed on
-ESTIMATE_SECONDS = 1.0  # a dearer estimate of the mesh is left to simulate
+ESTIMATE_SECONDS = 0.5  # a dearer estimate of the mesh is left to simulate
 LARGE = 200_000  # cells beyond which rank 0 does not look for the ends
-MOST_BUILT = 200_000  # unknowns of a box beyond which its sizes are computed and nothing of it is assembled
+BUILT_SECONDS = 0.5  # modelled time beyond which the sizes of a box are computed and nothing of it is assembled
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ class Explanation:
 
 def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
     """Assemble a scene, of a large box a copy on fewer cells, and say what it is. Collective."""
-    if unknowns_of(scene) > MOST_BUILT:
+    if build_seconds(scene) > BUILT_SECONDS:
         check_memory(scene, comm, False, len(scene.tissue.cells or []), box_simplices(scene.tissue.cells or []))
         copy = on_fewer_cells(scene, comm)
         if copy is not None:
@@ -166,18 +167,19 @@ def explain_model(model: Model) -> Explanation:
     return _explained(model.scene, coarser_copy(model), model_sizes(model), model)
 
 
-def unknowns_of(scene: Scene) -> int:
-    """Unknowns of the lattice of a box, those of the contact zone included; 0 for other scenes.
+def build_seconds(scene: Scene) -> float:
+    """Modelled time to build a box [s]; 0 for other scenes.
 
     Scenes are others too where a tolerance chooses the cells, and where a plan asks for the nodes of the mesh itself.
     """
     tissue, control, refine = scene.tissue, scene.control, scene.tissue.refine
     planned = control is not None and control.constraints is not None
     if not tissue.cells or scene._given is not None or planned:
-        return 0
-    n = _lattice(scene) * len(tissue.cells)
-    lines = refine is None or (by_lines(scene) and refine.tolerance is None and n <= refine.most)
-    return n if lines else 0
+        return 0.0
+    d = len(tissue.cells)
+    if refine is not None and not (by_lines(scene) and refine.tolerance is None and d * _lattice(scene) <= refine.most):
+        return 0.0
+    return BUILD[d, tissue.order] * box_simplices(tissue.cells)
 
 
 def _lattice(scene: Scene) -> int:

@@ -24,7 +24,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from softgrasp.study.forward.cautions import inexact, run_warnings
-from softgrasp.study.forward.explain import Explanation, explain, unknowns_of
+from softgrasp.study.forward.explain import Explanation, build_seconds, explain
 from softgrasp.study.forward.explain_page import run_explain, sections
 from softgrasp.study.report.document import show_sections
 from softgrasp.study.report.equation import equation
@@ -319,7 +319,7 @@ def test_a_box_too_large_to_build_is_explained_by_computed_sizes(
     scene = load_scene(name, [*changes, cells])
     monkeypatch.setattr("softgrasp.study.forward.explain.MOST_LOOKED_AT", {2: 4_000, 3: 2_000})
     own = explain(scene, comm)
-    monkeypatch.setattr("softgrasp.study.forward.explain.MOST_BUILT", 1000)
+    monkeypatch.setattr("softgrasp.study.forward.explain.BUILT_SECONDS", 1e-3)
     computed = explain(scene, comm)
     assert (own.built, computed.built, computed.coarser) == (True, False, own.coarser)
     assert (computed.sizes.nodes, computed.sizes.cells) == (own.sizes.nodes, own.sizes.cells)
@@ -338,9 +338,10 @@ def test_a_box_too_large_to_build_is_explained_by_computed_sizes(
 def test_scenes_that_need_their_own_mesh_are_built() -> None:
     """Cells that a tolerance chooses, more unknowns than are allowed, and plans, which ask for boundary nodes."""
     cells = "tissue.cells=[400,800]"
-    assert unknowns_of(load_scene("paper_forward", [cells])) == 2 * 401 * 801
-    assert unknowns_of(load_scene("paper_forward", [cells, "tissue.refine={most=700000}"])) == 2 * 401 * 801
-    assert unknowns_of(load_scene("paper_forward", [cells, "tissue.refine={}"])) == 0
-    assert unknowns_of(load_scene("paper_forward", [cells, "tissue.refine={most=700000,tolerance=0.01}"])) == 0
-    assert unknowns_of(load_scene("paper_forward", [cells, "tissue.refine={most=700000,method='bisect'}"])) == 0
-    assert unknowns_of(load_scene("paper_obstacle", [cells])) == 0
+    lines = "tissue.refine={most=700000}"
+    assert build_seconds(load_scene("paper_forward", [cells])) == pytest.approx(2.2, abs=0.1)  # 3.5e-6 s a triangle
+    assert build_seconds(load_scene("paper_forward", [cells, lines])) == pytest.approx(2.2, abs=0.1)
+    assert build_seconds(load_scene("paper_forward", [cells, "tissue.refine={}"])) == 0
+    assert build_seconds(load_scene("paper_forward", [cells, "tissue.refine={most=700000,tolerance=0.01}"])) == 0
+    assert build_seconds(load_scene("paper_forward", [cells, "tissue.refine={most=700000,method='bisect'}"])) == 0
+    assert build_seconds(load_scene("paper_obstacle", [cells])) == 0
