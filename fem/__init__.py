@@ -26,7 +26,7 @@ if TYPE_CHECKING:
         raise_on_all_ranks,
         shortened,
     )
-    from softgrasp.fem.fields.hdf import field_writer, run_of
+    from softgrasp.fem.fields.hdf import run_of
     from softgrasp.fem.fields.picture import PictureMesh, gather_picture, vertex_displacement
     from softgrasp.fem.fields.probe import Probe, make_probe
     from softgrasp.fem.fields.series import SeriesWriter

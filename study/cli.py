@@ -3,7 +3,7 @@
 # ruff: noqa: E402  (the other imports take a second, in which Ctrl-C shall not end in a traceback)
 from __future__ import annotations
 
-from softgrasp.study.shell.streams import quiet_imports
+from softgrasp.study.shell.loading import loading, quiet_imports
 
 quiet_imports()
 
@@ -155,7 +155,8 @@ def schema() -> None:
 @takes("scene out set_ empty", out="also write result.json and report.html into this folder")
 def explain(scene: Path, out: Path | None, set_: list[str] | None, empty: bool) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
-    from softgrasp.study.forward.explain_page import run_explain
+    with loading():
+        from softgrasp.study.forward.explain_page import run_explain
 
     run_explain(scene, out, set_ or [], console(), empty=empty)
 
@@ -177,7 +178,8 @@ def simulate(
     **shared: Any,
 ) -> None:
     """Run a scene with the full model; also under `mpiexec -n N`."""
-    from softgrasp.study.forward.run import run_simulate
+    with loading():
+        from softgrasp.study.forward.run import run_simulate
 
     _run(run_simulate, resume=resume, until=until, certify=certify, **shared)
 
@@ -199,7 +201,8 @@ def sweep(
     **shared: Any,
 ) -> None:
     """Simulate a scene at many values of its keys; resumes; `mpiexec -n N` runs N points at a time."""
-    from softgrasp.study.runs.run import run_sweep
+    with loading():
+        from softgrasp.study.runs.run import run_sweep
 
     _run(run_sweep, axes=axes, reduced=reduced, each=ranks_each, **shared)
 
@@ -233,7 +236,8 @@ def reduce(
     **shared: Any,
 ) -> None:
     """Build the reduced models of a scene and compare error and time; also under `mpiexec -n N`."""
-    from softgrasp.study.reduce.run import run_reduce
+    with loading():
+        from softgrasp.study.reduce.run import run_reduce
 
     _run(run_reduce, tolerance=None if tolerance is None else parse_tolerance(tolerance), **shared)
 
@@ -284,7 +288,8 @@ def query(
     Example: softgrasp reduce paper_forward --tolerance 1e-2, then
     softgrasp query out/paper_forward-reduce/models/certified.h5 --set lambda=77 --set mu=60
     """
-    from softgrasp.study.query.run import run_query
+    with loading():
+        from softgrasp.study.query.run import run_query
 
     status = run_query(
         model, console(), settings=set_ or [], motion=motion, dt=dt, tolerance=tolerance, allow=allow,
@@ -315,7 +320,8 @@ def control(
     **shared: Any,
 ) -> None:
     """Design the optimal feedback of a scene, reduce it and close the loop; also under `mpiexec -n N`."""
-    from softgrasp.study.control.run import run_control
+    with loading():
+        from softgrasp.study.control.run import run_control
 
     _run(run_control, gain_only=gain_only, retune=retune, **shared)
 
@@ -340,7 +346,9 @@ def study(
 ) -> None:
     """Show what accuracy costs in time; resumes what an earlier run of the same scene left in the output folder."""
     from softgrasp.study.precision.answer import parse_budget
-    from softgrasp.study.precision.run import run_study
+
+    with loading():
+        from softgrasp.study.precision.run import run_study
 
     limit = None if budget is None else parse_budget(budget)
     accuracy = None if tolerance is None else parse_tolerance(tolerance)
@@ -351,7 +359,8 @@ def study(
 @takes("scene out set_ quiet empty pdf")
 def effects(**shared: Any) -> None:
     """Switch every effect on and off: what it costs, what it changes, and whether the scene needs it."""
-    from softgrasp.study.effects.run import run_effects
+    with loading():
+        from softgrasp.study.effects.run import run_effects
 
     _run(run_effects, **shared)
 

@@ -90,13 +90,6 @@ def _mark(path: Path, run: str) -> None:
         file.attrs[NOTE] = run
 
 
-def field_writer(model: Model, directory: str | Path) -> SeriesWriter | None:
-    """The writer of the scene's ``output.fields``; None for none."""
-    kinds = {"vtu": SeriesWriter, "vtkhdf": HdfWriter}
-    kind = model.scene.output.fields
-    return kinds[kind](model, directory) if kind in kinds else None
-
-
 def run_of(path: Path) -> str:
     """Name of the run that wrote a file; empty where it is none of ours."""
     try:

@@ -1,10 +1,13 @@
-"""The midpoint step that a system needs."""
+"""The midpoint step that a system needs, and the store of its states."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.run.inexact import InexactMidpoint
 from softgrasp.fem.run.midpoint import TissueMidpoint
+from softgrasp.fem.run.snapshots import MemoryStore, NoStore
 from softgrasp.fem.solve.costs import STEP_RTOL
 from softgrasp.fem.solve.solvers import ITERATIVE, Reproducible, SolverName
 from softgrasp.fem.system import BlockSystem
@@ -50,3 +53,19 @@ def make_midpoint(
     from softgrasp.fem.run.finite_strain import FiniteStrainMidpoint  # only scenes with finite strain pay for it
 
     return FiniteStrainMidpoint(system, dt, solver, rtol, reproducible)
+
+
+def make_store(
+    system: BlockSystem, kind: str, steps: int, every: int, directory: Path, run: str | None, few: int | None = None
+) -> NoStore:
+    """Store of a run: memory, hdf5 or none; ``run`` is the name of a new run, None resumes. Collective.
+
+    ``few``: states that "auto" keeps; None keeps all.
+    """
+    if kind in ("auto", "memory"):
+        return MemoryStore(system, steps, every, few if kind == "auto" else None)
+    if kind == "hdf5":
+        from softgrasp.fem.run.streamed import Hdf5Store  # brings h5py
+
+        return Hdf5Store(system, steps, every, directory, run)
+    return NoStore(system)

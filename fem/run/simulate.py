@@ -31,9 +31,8 @@ from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_ch
 from softgrasp.fem.run.frames import boundaries, output_recorders
 from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.run.ledger import Ledger
-from softgrasp.fem.run.make import make_midpoint
+from softgrasp.fem.run.make import make_midpoint, make_store
 from softgrasp.fem.run.motion import Force, ForceDrive, TableDrive, force_taken, force_values, free_table
-from softgrasp.fem.run.snapshots import make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.solve.solvers import choose_solver

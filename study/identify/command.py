@@ -10,6 +10,7 @@ import typer
 from softgrasp.fem.errors import SceneError
 from softgrasp.study.shell.ending import console
 from softgrasp.study.shell.folder import default_folder
+from softgrasp.study.shell.loading import loading
 from softgrasp.study.shell.options import takes
 
 
@@ -80,7 +81,8 @@ def identify(
     Before measuring: softgrasp identify my.toml --fit mu,lambda --noise 1e-3 --suggest-markers 4
     """
     if suggest_markers is not None:
-        from softgrasp.study.identify.suggest.run import run_suggest
+        with loading():
+            from softgrasp.study.identify.suggest.run import run_suggest
 
         if data or robust or refine or posterior or certified is not None or law not in ("auto", "linear"):
             raise SceneError(
@@ -97,7 +99,8 @@ def identify(
         raise SceneError(
             "identify needs measurements, CSV files behind the scene; --motions and --rate go with --suggest-markers K"
         )
-    from softgrasp.study.identify.run import run_identify
+    with loading():
+        from softgrasp.study.identify.run import run_identify
 
     folder = out or default_folder("identify", scene)
     status = run_identify(

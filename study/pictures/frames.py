@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softgrasp.fem import Array, Model, Run, Trajectory, field_writer, frame_steps, note_of, remove_own, run_of, total
+from softgrasp.fem import Array, Model, Run, SeriesWriter, Trajectory, frame_steps, note_of, remove_own, total
 from softgrasp.fem.checksums import AGAIN, read_arrays, write_arrays
 from softgrasp.fem.errors import CheckpointError, raise_on_all_ranks
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement, vertex_values
@@ -30,7 +30,7 @@ class Frames:
 
     def __init__(self, model: Model, directory: Path, pictures: bool = True) -> None:
         self.model, self.directory, self.pictures = model, directory, pictures
-        self.writer = field_writer(model, directory)
+        self.writer = _writer(model, directory)
         self.legs = [0]
         self.foreign = False  # another run wrote in place of the field files of an earlier leg; rank 0 only
         self.saved = 0  # of the frames below, how many lie beside the checkpoint
@@ -76,6 +76,8 @@ class Frames:
             self.foreign = self.foreign or path.stem in own
             remove_own(self.directory, path.with_suffix(""), path)
         for path in self.directory.glob("fields*-*.vtkhdf"):
+            from softgrasp.fem.fields.hdf import run_of  # brings h5py
+
             left = path.stem.rsplit("-", 1)[0] in own
             if left and run_of(path) == run.name:
                 continue
@@ -198,3 +200,13 @@ class Frames:
 def _series(begun: int) -> str:
     """Stem of the field files of the leg that starts from a step."""
     return f"fields-from{begun}" if begun else "fields"
+
+
+def _writer(model: Model, directory: Path) -> SeriesWriter | None:
+    """The writer of the scene's ``output.fields``; None for none. Collective."""
+    kind = model.scene.output.fields
+    if kind == "vtkhdf":
+        from softgrasp.fem.fields.hdf import HdfWriter  # brings h5py
+
+        return HdfWriter(model, directory)
+    return SeriesWriter(model, directory) if kind == "vtu" else None

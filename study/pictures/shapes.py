@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from contourpy import contour_generator
-from PIL import Image, ImageDraw, ImageFilter
 
 from softgrasp.fem import Array, PictureMesh
 
@@ -243,6 +241,9 @@ def shadow(flat: Array, facets: Any, fine: int = 700) -> list[Array]:
     pixel = float(np.ptp(flat, axis=0).max()) / fine
     at = (flat - low) / pixel + 4.0  # [pixel], with a free border
     width, height = (np.ceil(at.max(axis=0)) + 5).astype(int)
+    from contourpy import contour_generator  # only pictures of 3D need it
+    from PIL import Image, ImageDraw, ImageFilter
+
     image = Image.new("L", (int(width), int(height)))
     draw = ImageDraw.Draw(image)
     for corners in at[facets].reshape(-1, 6).tolist():

@@ -11,7 +11,6 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
-from PIL import Image
 
 from softgrasp.fem import Scene, note, resolved_toml
 from softgrasp.fem.shown import unbroken
@@ -176,6 +175,8 @@ def _column(cells: Sequence[Any]) -> str:
 
 def _width(path: Path) -> int:
     """Width of a picture on the page: figures by their size in print, animations by their pixels."""
+    from PIL import Image  # only pages with pictures need it
+
     with Image.open(path) as image:
         dpi = image.info.get("dpi", (0, 0))[0]
         return round(image.width / dpi * PIXELS_PER_INCH) if dpi and path.suffix == ".png" else image.width

@@ -1,17 +1,12 @@
-"""Standard streams whose reader may leave, and Ctrl-C while modules load.
-
-Imports nothing but the standard library, so that it can come first.
-"""
+"""Standard streams whose reader may leave."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import locale
-import os
 import signal
 import sys
-from types import FrameType
 from typing import Any
 
 
@@ -47,23 +42,3 @@ def outlive_readers() -> None:
             buffer: Any = raw if isinstance(given.buffer, io.RawIOBase) else io.BufferedWriter(raw)
             how: dict[str, Any] = {"line_buffering": given.line_buffering, "write_through": given.write_through}
             setattr(sys, name, io.TextIOWrapper(buffer, given.encoding, "backslashreplace", **how))
-
-
-def quiet_imports() -> None:
-    """Let Ctrl-C end the program at once while modules load, where KeyboardInterrupt would tear compiled ones apart.
-
-    Leaves any handler but Python's own alone.
-    """
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        with contextlib.suppress(ValueError):  # not the main thread
-            signal.signal(signal.SIGINT, _interrupt)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    outer = frame
-    while outer is not None:
-        if outer.f_code.co_filename == "<frozen importlib._bootstrap>":
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
-        outer = outer.f_back
-    signal.default_int_handler(number, frame)

@@ -56,7 +56,7 @@ def test_restart_leaves_the_same_streamed_snapshots(
 ) -> None:
     extra = ('output.snapshots="hdf5"', "output.every=3")
     monkeypatch.setattr(
-        "softgrasp.fem.run.snapshots.BUFFER_BYTES", 20_000
+        "softgrasp.fem.run.streamed.BUFFER_BYTES", 20_000
     )  # a few columns: the buffer is filled several times
     simulate(small(comm, *extra), RunOptions(directory=mpi_tmp_path / "whole"))
     with pytest.raises(Interrupted):
