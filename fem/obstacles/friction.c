@@ -1,126 +1,15 @@
 /* Coulomb's law at k nodes with m tangents each, see coulomb.py: Newton's method on the sets open, stick and slip, whose
-   factor stays while few rows of its matrix change. Rows of a node: its normal, then its tangents. */
+   equations are solved by conjugate residuals from the factor of some earlier round. Rows of a node: its normal, then
+   its tangents. */
 #include "rub.h"
 
-/* Gaussian elimination with pivots of a small matrix by rows; b becomes the solution. */
-static void eliminate(int n, double *A, int ld, double *b) {
-  for (int j = 0; j < n; j++) {
-    int p = j;
-    for (int i = j + 1; i < n; i++)
-      if (fabs(A[i * ld + j]) > fabs(A[p * ld + j])) p = i;
-    if (p != j) {
-      double t = b[p];
-      b[p] = b[j];
-      b[j] = t;
-      for (int c = 0; c < n; c++) {
-        t = A[p * ld + c];
-        A[p * ld + c] = A[j * ld + c];
-        A[j * ld + c] = t;
-      }
-    }
-    for (int i = j + 1; i < n; i++) {
-      const double t = A[i * ld + j] / A[j * ld + j];
-      for (int c = j; c < n; c++) A[i * ld + c] -= t * A[j * ld + c];
-      b[i] -= t * b[j];
-    }
-  }
-  for (int j = n - 1; j >= 0; j--) {
-    for (int c = j + 1; c < n; c++) b[j] -= A[j * ld + c] * b[c];
-    b[j] /= A[j * ld + j];
-  }
-}
+static const double NEAR = 0.2, EXACT = 1e-14; /* by how much a round reduces its residual, in 3D and in 2D */
 
-/* Rows of the matrix that are not those of the factor; 0 where they are too many. */
-static int compare(Rub *f) {
-  const int s = 1 + f->m, K = f->k * s;
-  int count = 0;
-  for (int i = 0; i < f->k; i++)
-    for (int a = 0; a < s; a++) {
-      const int one = f->kind[i], two = f->kind0[i];
-      int differs = a == 0 ? (one == OPEN) != (two == OPEN) : one != two;
-      if (a > 0 && f->m == 1 && one == SLIP && two == SLIP) differs = f->e[i * s] != f->e0[i * s];
-      if (!differs) continue;
-      if (count == f->most) return 0;
-      const int r = i * s + a;
-      int j = count;
-      while (j < f->count && f->other[j] != r) j++;
-      if (j < f->count) { /* its unit is solved for already: move it here */
-        for (int c = 0; c < K && j != count; c++) {
-          const double t = f->Z[(size_t)j * K + c];
-          f->Z[(size_t)j * K + c] = f->Z[(size_t)count * K + c];
-          f->Z[(size_t)count * K + c] = t;
-        }
-        f->other[j] = f->other[count];
-      } else {
-        if (count < f->count) { /* keep the one that was here, if there is room */
-          if (f->count < f->most) {
-            memcpy(f->Z + (size_t)f->count * K, f->Z + (size_t)count * K, K * sizeof(double));
-            f->other[f->count++] = f->other[count];
-          }
-        } else {
-          f->count++;
-        }
-        double *z = f->Z + (size_t)count * K;
-        memset(z, 0, K * sizeof(double));
-        z[r] = 1;
-        back(f, z);
-      }
-      f->other[count] = r;
-      double *v = f->V + (size_t)count * K;
-      row_of(f, i, a, two, f->e0 + i * s, f->room);
-      row_of(f, i, a, one, f->e + i * s, v);
-      for (int c = 0; c < K; c++) v[c] -= f->room[c];
-      count++;
-    }
-  return 1 + count;
-}
-
-/* The units of the rows that are not those of the factor, solved for anew. */
-void softgrasp_units(Rub *f) {
-  for (int j = 0; j < f->count; j++) {
-    double *z = f->Z + (size_t)j * f->rows;
-    memset(z, 0, f->rows * sizeof(double));
-    z[f->other[j]] = 1;
-    back(f, z);
-  }
-}
-
-/* b <- J^-1 b for the matrix of the present sets, with `count` rows that are not those of the factor. */
-static void solve(Rub *f, int count, double *b, double *t) {
-  const int K = f->rows;
-  back(f, b);
-  if (!count) return;
-  for (int i = 0; i < count; i++) {
-    const double *v = f->V + (size_t)i * K;
-    for (int j = 0; j < count; j++) f->C[i * f->most + j] = (i == j) + dot(K, v, f->Z + (size_t)j * K);
-    t[i] = dot(K, v, b);
-  }
-  eliminate(count, f->C, f->most, t);
-  for (int i = 0; i < count; i++)
-    for (int c = 0; c < K; c++) b[c] -= t[i] * f->Z[(size_t)i * K + c];
-}
-
-/* y = W x + q; W is larger than the caches, so that only its lower half is read. */
+/* y = W x + q. */
 static void evaluate(const Rub *f) {
   const int K = f->k * (1 + f->m);
-  const double *x = f->x;
-  double *restrict y = f->y;
-  memcpy(y, f->q, K * sizeof(double));
-  for (int r = 0; r < K; r++) {
-    const double *w = f->W + (size_t)r * f->ld, t = x[r];
-    double s[8] = {0};
-    int j = 0;
-    for (; j + 8 <= r; j += 8)
-      for (int l = 0; l < 8; l++) {
-        s[l] += w[j + l] * x[j + l];
-        y[j + l] += w[j + l] * t;
-      }
-    for (; j < r; j++) {
-      s[0] += w[j] * x[j];
-      y[j] += w[j] * t;
-    }
-    y[r] += w[r] * t + (((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7])));
-  }
+  times_in_double(K, f->ld, f->W, f->x, f->y);
+  for (int r = 0; r < K; r++) f->y[r] += f->q[r];
 }
 
 /* New sets and directions from x and y; whether a set changed. */
@@ -162,16 +51,37 @@ static int classify(Rub *f) {
   return changed;
 }
 
-/* Forces that continue those of the last two steps, with their sets and directions; those of the last step into `before`. */
-void softgrasp_lead(Rub *f) {
+/* y as the sets say, and x with it, where y is unknown; `all`: x from y alone. */
+static void adapt(const Rub *f, int all) {
   const int s = 1 + f->m, K = f->k * s;
+  double *u = f->room, *v = u + K;
+  int some = all;
   for (int r = 0; r < K; r++) {
-    const double x = f->x[r];
-    f->x[r] = f->kind[r / s] == OPEN ? 0 : 2 * x - f->before[r];
-    f->before[r] = x;
+    const int kind = f->kind[r / s];
+    u[r] = kind == STICK || (kind == SLIP && r % s == 0) ? -f->y[r] : 0;
+    some |= u[r] != 0;
+    f->y[r] += u[r];
+    if (all) u[r] = f->y[r] - f->q[r];
   }
-  evaluate(f);
-  classify(f);
+  if (!some) return;
+  times(f, 1, u, v, NULL);
+  for (int r = 0; r < K; r++) f->x[r] = (all ? 0 : f->x[r]) + v[r];
+}
+
+/* Where rounds begin: with `lead` from forces or slips that continue those of the last two steps; those of the last step
+   into `before`. `known`: whether y is W x + q. */
+void softgrasp_begin(Rub *f, int lead, int known) {
+  const int s = 1 + f->m, K = f->k * s;
+  f->begun = 0;
+  for (int r = 0; lead && r < K; r++) {
+    const double x = f->x[r], y = f->y[r];
+    if (f->slips) f->y[r] = 2 * y - f->before_y[r];
+    else f->x[r] = f->kind[r / s] == OPEN ? 0 : 2 * x - f->before[r];
+    f->before[r] = x, f->before_y[r] = y;
+  }
+  if (!known && !(lead && f->slips)) evaluate(f);
+  if (f->slips) adapt(f, lead);
+  if (lead) classify(f);
 }
 
 /* Residual of the equations of the present sets into b; the largest. */
@@ -191,66 +101,165 @@ static double residual(const Rub *f, double *b) {
   return most;
 }
 
+/* What a set says of forces, exactly. */
+static void settle(const Rub *f) {
+  const int s = 1 + f->m;
+  for (int i = 0; i < f->k; i++) {
+    double *x = f->x + i * s;
+    for (int a = 0; a < s; a++)
+      if (f->kind[i] == OPEN) x[a] = 0;
+      else if (a > 0 && f->kind[i] == SLIP && f->m == 1) x[a] = f->mu[i] * x[0] * f->e[i * s];
+  }
+}
+
 static char side(const Rub *f, int i) {
   return (char)(f->kind[i] == SLIP && f->e[i * (1 + f->m)] < 0 ? 3 : f->kind[i]);
 }
 
-/* Step b of the method from that of the kept factor, with the last `taken` steps, since which no set has changed: Broyden's
-   update [Broyden65] by the steps alone. They are in `past`, and b is put behind them. */
-static void accelerate(const Rub *f, int taken, double *b) {
-  const int K = f->rows;
-  double *last = f->past + (size_t)taken * K;
-  for (int j = 0; j < taken; j++) {
-    const double *s = f->past + (size_t)j * K, *next = s + K, share = dot(K, s, b) / dot(K, s, s);
-    if (j + 1 < taken)
-      for (int r = 0; r < K; r++) b[r] += share * next[r];
-    else if (fabs(share) < 0.9)
-      for (int r = 0; r < K; r++) b[r] /= 1 - share;
+/* Rows of the matrix of the present sets times u and v. */
+static void rows_times(const Rub *f, const double *u, const double *v, double *to) {
+  const int s = 1 + f->m;
+  double of_v[3], of_u[3];
+  for (int i = 0; i < f->k; i++, u += s, v += s)
+    for (int a = 0; a < width(f, f->slips, f->kind[i]); a++, to++) {
+      row_of(f, f->slips, i, f->kind[i], f->e + i * s, a, of_v, of_u);
+      *to = 0;
+      for (int b = 0; b < s; b++) *to += of_v[b] * v[b] + of_u[b] * u[b];
+    }
+}
+
+static void spread(const Rub *f, const double *c, double *u) {
+  const int s = 1 + f->m;
+  for (int i = 0; i < f->k; i++) c += lengthen(f, f->slips, i, f->kind[i], f->e + i * s, c, u + i * s);
+}
+
+/* Changes of u that the present sets say into u; whether there are any. */
+static int say(const Rub *f, double *u) {
+  const int s = 1 + f->m;
+  int some = 0;
+  for (int i = 0; i < f->k; i++) {
+    const double *x = f->x + i * s, *y = f->y + i * s, *e = f->e + i * s;
+    double *own = u + i * s, along = f->mu[i] * x[0];
+    for (int a = 0; a < s; a++) own[a] = 0;
+    if (!f->slips && f->kind[i] == OPEN)
+      for (int a = 0; a < s; a++) own[a] = -x[a];
+    if (f->slips && f->kind[i] != OPEN) own[0] = -y[0];
+    for (int a = 1; a < s; a++) along -= e[a - 1] * x[a];
+    for (int a = 1; a < s; a++)
+      if (f->slips && f->kind[i] == STICK) own[a] = -y[a];
+      else if (!f->slips && f->kind[i] == SLIP) own[a] = along * e[a - 1];
+    for (int a = 0; a < s; a++) some |= own[a] != 0;
   }
-  memcpy(last, b, K * sizeof(double));
+  return some;
+}
+
+/* A round: Newton's equations of the present sets. */
+static void begin_round(Rub *f) {
+  const int s = 1 + f->m, K = f->k * s;
+  double *b = f->room, *u = b + K, *v = u + K, *to = f->lacks;
+  const int some = say(f, u);
+  residual(f, b);
+  if (some) times(f, 0, u, v, (float *)(v + K));
+  else memset(v, 0, K * sizeof(double));
+  rows_times(f, u, v, f->solved);
+  f->n = 0;
+  for (int i = 0; i < f->k; i++) {
+    const double *h = b + i * s, *e = f->e + i * s;
+    const int count = width(f, f->slips, f->kind[i]);
+    for (int a = 0; a < count; a++)
+      to[a] = -(f->kind[i] != SLIP || (!f->slips && a == 0) ? h[a] : f->slips ? h[1 + a] : e[0] * h[2] - e[1] * h[1]);
+    to += count;
+    f->n += count;
+  }
+  for (int j = 0; j < f->n; j++) f->lacks[j] -= f->solved[j];
+  memset(f->solved, 0, K * sizeof(double));
+  f->left = sqrt(dot(f->n, f->lacks, f->lacks));
+  f->target = fmax(f->m > 1 ? NEAR * f->left : EXACT * f->left, 0.01 * f->tol);
+  f->taken = 0;
+  f->begun = 1;
+}
+
+/* Steps of generalized conjugate residuals [EES83] to the end of the round. WANTED: a factor that costs less than more
+   steps from this one. */
+static int descend(Rub *f) {
+  const int K = f->k * (1 + f->m), n = f->n, wide = f->single ? 4 : 8;
+  double *u = f->room, *v = u + K;
+  const double step = wide * (0.5 * n * K + (double)n * n) / READ, factor = CALL + 2.0 / 3 * n * n * n / FLOPS * wide / 4;
+  while (f->left > f->target && f->taken < KEPT) {
+    if (!f->rows || f->slips0 != f->slips || (f->age && f->work > factor)) return WANTED;
+    double *z = f->Z + (size_t)f->taken * K, *c = f->C + (size_t)f->taken * K;
+    f->work += step;
+    f->age++;
+    precondition(f, f->lacks, z);
+    spread(f, z, u);
+    times(f, 0, u, v, (float *)(v + K));
+    rows_times(f, u, v, c);
+    const double whole = dot(n, c, c);
+    for (int j = 0; j < f->taken; j++) {
+      const double *C = f->C + (size_t)j * K, *Z = f->Z + (size_t)j * K, t = dot(n, C, c);
+      for (int r = 0; r < n; r++) c[r] -= t * C[r], z[r] -= t * Z[r];
+    }
+    const double own = dot(n, c, c), size = sqrt(own), share = dot(n, c, f->lacks) / size;
+    if (!(own > 1e-28 * whole)) break; /* rounding */
+    for (int r = 0; r < n; r++) {
+      c[r] /= size, z[r] /= size;
+      f->lacks[r] -= share * c[r];
+      f->solved[r] += share * z[r];
+    }
+    f->left = sqrt(dot(n, f->lacks, f->lacks));
+    f->taken++;
+  }
+  return SOLVED;
+}
+
+static void end_round(Rub *f) {
+  const int s = 1 + f->m, K = f->k * s;
+  double *u = f->room, *v = u + K, *known = v + K;
+  say(f, known);
+  spread(f, f->solved, u);
+  for (int r = 0; r < K; r++) u[r] += known[r];
+  f->begun = 0;
+  if (f->slips) {
+    times(f, 1, u, v, NULL);
+    for (int r = 0; r < K; r++) f->y[r] += u[r], f->x[r] += v[r];
+    return;
+  }
+  for (int r = 0; r < K; r++) f->x[r] += u[r];
+  settle(f);
+  evaluate(f);
 }
 
 /* Rounds from round `begin` on. WANTED: call softgrasp_matrix, factor LU, and call again with the round in tally[2]. */
-int softgrasp_rub(Rub *f, int begin, int rounds) {
-  const int s = 1 + f->m, K = f->k * s;
-  int slow = 0;
-  double *b = f->room + K, *t = b + K, last = INFINITY;
-  evaluate(f);
-  for (int round = begin, taken = 0; round < rounds; round++) {
-    int count = f->rows == K ? compare(f) : 0;
-    f->tally[2] = round;
-    if (!count) return WANTED;
-    f->tally[0]++;
-    for (int i = 0; i < f->k; i++) f->seen[(size_t)round * f->k + i] = side(f, i);
-    residual(f, b);
-    solve(f, count - 1, b, t);
-    for (int r = 0; r < K; r++) b[r] = -b[r];
-    if (f->m > 1) accelerate(f, taken, b);
-    for (int r = 0; r < K; r++) f->x[r] += b[r];
-    for (int i = 0; i < f->k; i++) { /* what a set says, exactly */
-      double *x = f->x + i * s;
-      for (int a = 0; a < s; a++)
-        if (f->kind[i] == OPEN) x[a] = 0;
-        else if (a > 0 && f->kind[i] == SLIP && f->m == 1) x[a] = f->mu[i] * x[0] * f->e[i * s];
-    }
-    evaluate(f);
-    const int changed = classify(f);
-    const double left = residual(f, b);
-    if (!changed && left <= f->tol) return SOLVED;
-    if (!(left < INFINITY)) return CYCLED;
-    if (changed && f->m == 1)
-      for (int p = 0; p <= round; p++) {
+int softgrasp_rub(Rub *f, int begin, int rounds, int led) {
+  double *b = f->room;
+  for (int round = begin, drifts = 0;; round++) {
+    if (!f->begun) {
+      double left = residual(f, b);
+      int changed = 0;
+      if (round || led || left <= f->tol) changed = classify(f), left = residual(f, b);
+      if (!changed && left <= f->tol) {
+        if (!f->slips) return SOLVED;
+        settle(f);
+        evaluate(f);
+        changed = classify(f);
+        if (!changed && residual(f, b) <= f->tol) return SOLVED;
+        if (++drifts > DRIFTS) return DRIFTED;
+      }
+      if (!round || left < f->best / 2) f->best = left, f->since = round;
+      if (!(left < INFINITY) || round >= rounds || (f->m > 1 && round - f->since > PATIENCE)) return CYCLED;
+      for (int p = 0; changed && f->m == 1 && p < round; p++) {
         int same = 1;
-        for (int i = 0; i < f->k && same; i++)
-          same = f->seen[(size_t)p * f->k + i] == side(f, i);
+        for (int i = 0; i < f->k && same; i++) same = f->seen[(size_t)p * f->k + i] == side(f, i);
         if (same) return CYCLED;
       }
-    taken = changed ? 0 : taken + 1;
-    slow = (f->m > 1 || !changed) && left > SLOW * last ? slow + 1 : 0;
-    if (slow == LATE || taken == PAST) f->rows = slow = 0; /* directions have turned: factor anew */
-    last = f->m == 1 && changed ? INFINITY : left;
+      for (int i = 0; i < f->k; i++) f->seen[(size_t)round * f->k + i] = side(f, i);
+      f->tally[0]++;
+      begin_round(f);
+    }
+    f->tally[2] = round;
+    if (descend(f) == WANTED) return WANTED;
+    end_round(f);
   }
-  return CYCLED;
 }
 
 /* Sweeps of projected Gauss-Seidel over the nodes until forces change by less than `still` of the largest; sets. */

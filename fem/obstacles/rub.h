@@ -1,170 +1,233 @@
-/* Newton's method with Coulomb friction, see friction.c: its data, its matrix and the factor of that. Of a slipping node
-   the row along its direction e is w (d_t'e - mu d_n) alone, w a number: the factor is without it. */
+/* Newton's method with Coulomb friction, see friction.c: its data, its unknowns and the factor of its matrix.
+
+   Of y = W x + q one side is unknown, u, and the other follows, v: forces x of pressed nodes, or, from W^-1, the slips y of
+   slipping nodes and the gaps of open ones. What the sets say of u is known: no force of an open node, no slip of a
+   sticking one, no gap of a pressed one, and the force of a slipping node along its direction e is mu times the normal
+   one. The rest has one row of the matrix each. */
 #pragma once
 #include "dense.h"
 
 #define REAL double
+#define VEC Vec_double
 #define DOT dot_in_double
 #define BACK back_in_double
+#define TIMES times_in_double
 #include "triangle.h"
 #undef REAL
+#undef VEC
 #undef DOT
 #undef BACK
+#undef TIMES
 #define REAL float
+#define VEC Vec_float
 #define DOT dot_in_float
 #define BACK back_in_float
+#define TIMES times_in_float
 #include "triangle.h"
 
 enum { OPEN, STICK, SLIP };
-enum { SOLVED = 0, WANTED = 1, CYCLED = 2 };
-enum { LATE = 2, PAST = 15 };        /* steps that are kept, at most */
+enum { SOLVED = 0, WANTED = 1, CYCLED = 2, DRIFTED = 3 }; /* the last: W^-1 is too inexact */
+enum { KEPT = 24, DRIFTS = 3, PATIENCE = 12 }; /* steps of a round, refinements of W^-1, rounds without gain, at most */
 static const double RIDGE_SINGLE = 1e-7; /* as RIDGE, of a factor in single precision */
-static const double SLOW = 0.3; /* by how much a round should reduce the residual */
+static const double READ = 2e10, FLOPS = 5e10, CALL = 3e-5; /* bytes and operations per second, seconds of a call: what
+                                                               steps and factors cost in proportion */
 
 typedef struct {
-  int k, m, ld;          /* nodes, tangents, columns of W */
+  int k, m, ld;              /* nodes, tangents, columns of W */
   const double *W, *q, *mu;
-  double tol;            /* of gaps and slips */
-  double *before;        /* forces of the step before the last (k (1 + m)) */
-  double *x, *y;         /* forces, and W x + q (k (1 + m)) */
-  int *kind;             /* sets (k) */
-  double *e;             /* of a slipping node: direction of its force, and mu x_n over |x_t - y_t / W_tt| (k (m + 1)) */
-  int rows, size;        /* K = k (1 + m) where there is a factor, else 0; its unknowns */
-  int single;            /* whether the factor is in single precision */
-  double *LU;            /* factor of the transpose, by columns (size, size), */
-  float *LU_single;      /* or this one */
+  const double *inverse;     /* of W, (K, K) with K = k (1 + m), or NULL */
+  const float *low, *inverse_low; /* both in single precision, where steps use it, or NULL */
+  double tol;                /* of gaps and slips */
+  double *before, *before_y; /* x and y at the end of the step before the last (K) */
+  double *x, *y;             /* forces, and W x + q (K) */
+  int *kind;                 /* sets (k) */
+  double *e;                 /* of a slipping node: direction of its force, and mu x_n over |x_t - y_t / W_tt| (k (m + 1)) */
+  int slips;                 /* whether the unknowns are y */
+  int rows, size;            /* K where there is a factor, else 0; its unknowns */
+  int single;                /* whether the factor is in single precision */
+  double *LU;                /* factor of the transpose, by columns (size, size), */
+  float *LU_single;          /* or this one */
   int *pivot;
-  int *kind0;            /* sets and directions that it is of */
+  int slips0, *kind0;        /* sides, sets and directions that it is of */
   double *e0;
-  int most, count;       /* rows of the matrix that may be others than those of the factor, and that are */
-  int *other;            /* these rows (most) */
-  double *Z, *V, *C;     /* factor^-1 of their units, what they are more (most, K); small matrix (most, most) */
-  double *room;          /* 6 K + most numbers */
-  double *past;          /* steps of rounds in which no set changed (PAST + 1, K) */
-  char *seen;            /* sets of the rounds (ROUNDS, k) */
-  long *tally;           /* rounds, sweeps */
+  int age;                   /* steps that it led to, */
+  double work;               /* and their cost [s] */
+  int begun, taken, n;       /* whether a round is in work, its steps and unknowns */
+  double left, target;       /* its residual, and where it ends */
+  double *solved, *lacks;    /* unknowns of the round, and residual (K) */
+  double *Z, *C;             /* its steps, and the matrix times them (KEPT, K) */
+  double *room;              /* 8 K numbers */
+  double best;               /* least residual of the rounds, but for a factor of 2, */
+  int since;                 /* and its round */
+  char *seen;                /* sets of the rounds (ROUNDS, k) */
+  long *tally;               /* rounds, sweeps, and the round that wants a factor */
 } Rub;
 
 static double diagonal(const Rub *f, int r) { return f->W[(size_t)r * f->ld + r]; }
 
-static void row_of(const Rub *f, int i, int a, int kind, const double *e, double *v) {
-  const int s = 1 + f->m, K = f->k * s, r = i * s + a;
-  memset(v, 0, K * sizeof(double));
+/* Unknowns of a node. */
+static int width(const Rub *f, int slips, int kind) {
+  if (kind == SLIP) return f->m;
+  return (kind == OPEN) == slips ? 1 + f->m : 0;
+}
+
+/* Row r of a node as coefficients of its v and u. */
+static void row_of(const Rub *f, int slips, int i, int kind, const double *e, int r, double *of_v, double *of_u) {
+  const int first = i * (1 + f->m);
+  const double w = diagonal(f, first + 1), c = f->m > 1 ? e[f->m] : 0;
+  for (int b = 0; b <= f->m; b++) of_v[b] = of_u[b] = 0;
   if (kind == OPEN) {
-    v[r] = diagonal(f, r);
-  } else if (a == 0 || kind == STICK) {
-    memcpy(v, f->W + (size_t)r * f->ld, K * sizeof(double));
-    v[r] *= 1 + RIDGE;
+    of_v[r] = diagonal(f, first + r);
+  } else if (!slips && (kind == STICK || r == 0)) {
+    of_v[r] = 1;
+  } else if (!slips) { /* across e, with two tangents */
+    of_v[1] = -c * e[1], of_v[2] = c * e[0];
+    of_u[1] = -w * (1 - c) * e[1], of_u[2] = w * (1 - c) * e[0];
   } else {
-    const double w = diagonal(f, i * s + 1), c = f->m > 1 ? e[f->m] : 0;
+    of_v[0] = -w * f->mu[i] * e[r];
     for (int b = 0; b < f->m; b++) {
-      const double P = (a - 1 == b) - e[a - 1] * e[b];
-      if (c != 0) {
-        const double *W = f->W + (size_t)(i * s + 1 + b) * f->ld;
-        for (int j = 0; j < K; j++) v[j] += c * P * W[j];
-      }
-      v[i * s + 1 + b] += w * ((a - 1 == b) - c * P);
+      of_u[1 + b] = c * ((r == b) - e[r] * e[b]);
+      of_v[1 + b] = w * ((r == b) - of_u[1 + b]);
     }
-    v[i * s] -= w * f->mu[i] * e[a - 1];
   }
 }
 
-/* A row v (K) of J times d, d the unknowns of the factor: (n, t..) of a sticking node, n of a slipping one and, with two
-   tangents, the way p across its direction e; d_t = (mu d_n) e + d_p p, and open nodes have none. */
-static void shorten(const Rub *f, const double *v, double *to) {
+/* Numbers of a node from its u or from its row of the matrix (times the numbers): its unknowns. */
+static int shorten(const Rub *f, int slips, int i, int kind, const double *e, const double *v, double *to) {
   const int s = 1 + f->m;
-  for (int j = 0; j < f->k; j++, v += s) {
-    const double *e = f->e0 + j * s;
-    if (f->kind0[j] == OPEN) continue;
-    if (f->kind0[j] == STICK) {
-      for (int b = 0; b < s; b++) *to++ = v[b];
-    } else if (f->m == 1) {
-      *to++ = v[0] + f->mu[j] * e[0] * v[1];
-    } else {
-      *to++ = v[0] + f->mu[j] * (e[0] * v[1] + e[1] * v[2]);
-      *to++ = e[0] * v[2] - e[1] * v[1];
-    }
+  if (kind != SLIP) {
+    const int count = width(f, slips, kind);
+    for (int b = 0; b < count; b++) to[b] = v[b];
+    return count;
   }
+  if (slips) {
+    for (int b = 1; b < s; b++) to[b - 1] = v[b];
+  } else {
+    to[0] = v[0];
+    for (int b = 1; b < s; b++) to[0] += f->mu[i] * e[b - 1] * v[b];
+    if (f->m > 1) to[1] = e[0] * v[2] - e[1] * v[1];
+  }
+  return f->m;
 }
 
-/* The row of a slipping node across its direction, with two tangents. */
-static void across(const Rub *f, int i, const double *e, double *restrict v) {
-  const int K = 3 * f->k, r = 3 * i + 1;
-  const double *W = f->W + (size_t)r * f->ld, *W2 = W + f->ld, own = diagonal(f, r) * (1 - e[2]);
-  for (int j = 0; j < K; j++) v[j] = e[2] * (e[0] * W2[j] - e[1] * W[j]);
-  v[r] -= own * e[1];
-  v[r + 1] += own * e[0];
+/* u of a node of its unknowns. */
+static int lengthen(const Rub *f, int slips, int i, int kind, const double *e, const double *c, double *u) {
+  const int s = 1 + f->m, count = width(f, slips, kind);
+  for (int b = 0; b < s; b++) u[b] = 0;
+  if (kind != SLIP) {
+    for (int b = 0; b < count; b++) u[b] = c[b];
+  } else if (slips) {
+    for (int b = 1; b < s; b++) u[b] = c[b - 1];
+  } else {
+    u[0] = c[0];
+    for (int b = 1; b < s; b++) u[b] = f->mu[i] * c[0] * e[b - 1];
+    if (f->m > 1) u[1] -= c[1] * e[1], u[2] += c[1] * e[0];
+  }
+  return count;
 }
 
-/* The matrix of the present sets without what single rows say, by rows, into LU. */
+/* v = W u, or W^-1 u; `exact` in double precision. Room for 2 K numbers of type float behind v. */
+static void times(const Rub *f, int exact, const double *u, double *v, float *room) {
+  const int K = f->k * (1 + f->m), ld = f->slips ? K : f->ld;
+  const float *low = f->slips ? f->inverse_low : f->low;
+  if (exact || !low) {
+    times_in_double(K, ld, f->slips ? f->inverse : f->W, u, v);
+    return;
+  }
+  for (int r = 0; r < K; r++) room[r] = (float)u[r];
+  times_in_float(K, K, low, room, room + K);
+  for (int r = 0; r < K; r++) v[r] = room[K + r];
+}
+
+/* The matrix of the present sets by rows, into LU. */
 void softgrasp_matrix(Rub *f) {
-  const int s = 1 + f->m, K = f->k * s;
-  double *v = f->room, *row = v + K;
+  const int s = 1 + f->m, K = f->k * s, ld = f->slips ? K : f->ld;
+  const double *M = f->slips ? f->inverse : f->W;
+  double *v = f->room, *row = v + K, of_v[3], of_u[3];
   memcpy(f->kind0, f->kind, f->k * sizeof(int));
   memcpy(f->e0, f->e, (size_t)f->k * s * sizeof(double));
+  f->slips0 = f->slips;
   f->rows = K;
-  f->count = f->size = 0;
-  for (int i = 0; i < f->k; i++) f->size += f->kind[i] == OPEN ? 0 : f->kind[i] == STICK ? s : f->m;
+  f->size = f->age = 0;
+  f->work = 0;
+  for (int i = 0; i < f->k; i++) f->size += width(f, f->slips, f->kind[i]);
   for (int i = 0, r = 0; i < f->k; i++)
-    for (int a = 0; a < (f->kind[i] == OPEN ? 0 : f->kind[i] == STICK ? s : f->m); a++, r++) {
-      if (a > 0 && f->kind[i] == SLIP) across(f, i, f->e + i * s, v);
-      else row_of(f, i, a, f->kind[i], f->e + i * s, v);
-      if (f->single && (a == 0 || f->kind[i] == STICK)) v[i * s + a] *= 1 + RIDGE_SINGLE;
-      shorten(f, v, f->single ? row : f->LU + (size_t)r * f->size);
+    for (int a = 0; a < width(f, f->slips, f->kind[i]); a++, r++) {
+      const double *rows = M + (size_t)i * s * ld;
+      row_of(f, f->slips, i, f->kind[i], f->e + i * s, a, of_v, of_u);
+      if (f->m > 1)
+        for (int j = 0; j < K; j++) v[j] = of_v[0] * rows[j] + of_v[1] * rows[ld + j] + of_v[2] * rows[2 * (size_t)ld + j];
+      else
+        for (int j = 0; j < K; j++) v[j] = of_v[0] * rows[j] + of_v[1] * rows[ld + j];
+      for (int b = 0; b < s; b++) v[i * s + b] += of_u[b];
+      if (!f->slips && (a == 0 || f->kind[i] == STICK)) v[i * s + a] *= 1 + (f->single ? RIDGE_SINGLE : RIDGE);
+      double *to = f->single ? row : f->LU + (size_t)r * f->size;
+      for (int j = 0; j < f->k; j++) to += shorten(f, f->slips, j, f->kind[j], f->e + j * s, v + j * s, to);
       for (int j = 0; f->single && j < f->size; j++) f->LU_single[(size_t)r * f->size + j] = (float)row[j];
     }
 }
 
-/* b <- J^-1 b for the J that the factor is of. Rows of open nodes, and those of slipping nodes along e, say what they are
-   without the others, d_e = mu d_n + b_e / w; W takes it into the others' right-hand side. */
-static void back(const Rub *f, double *restrict b) {
-  const int s = 1 + f->m, K = f->rows;
-  double *g = f->room + 3 * K + f->most, *c = g + K, *known = c + K;
-  float *low = (float *)g;
-  int some = 0, r = 0;
-  memset(g, 0, K * sizeof(double));
-  memset(known, 0, K * sizeof(double));
-  for (int i = 0; i < f->k; i++) {
-    const double *e = f->e0 + i * s, w = diagonal(f, i * s + 1);
-    double *own = known + i * s, along = 0;
-    if (f->kind0[i] == STICK) continue;
-    if (f->kind0[i] == OPEN)
-      for (int a = 0; a < s; a++) own[a] = b[i * s + a] / diagonal(f, i * s + a);
-    for (int a = 0; f->kind0[i] == SLIP && a < f->m; a++) along += e[a] * b[i * s + 1 + a] / w;
-    for (int a = 0; f->kind0[i] == SLIP && a < f->m; a++) own[1 + a] = along * e[a];
-    for (int a = 0; a < s; a++) {
-      if (own[a] == 0) continue;
-      const double *W = f->W + (size_t)(i * s + a) * f->ld, t = own[a];
-      for (int j = 0; j < K; j++) g[j] += t * W[j];
-      some = 1;
+/* z: unknowns that the rows g ask for if the sets were those of the factor; those of other sets from their own node. */
+static void precondition(const Rub *f, const double *g, double *z) {
+  const int s = 1 + f->m, K = f->k * s, slips = f->slips;
+  double *c = f->room + 6 * K, full[3], own[2][2], of_v[3], of_u[3];
+  float *low = (float *)(c + K);
+  const double *from = g;
+  int r = 0;
+  for (int i = 0; i < f->k; i++) { /* rows of the factor, from those of the node */
+    const double *e = f->e + i * s;
+    const int kind = f->kind[i], count = width(f, slips, kind);
+    full[0] = full[1] = full[2] = 0;
+    if (kind != SLIP || f->m == 1)
+      for (int b = 0; b < count; b++) full[kind == SLIP && slips ? 1 + b : b] = from[b];
+    else if (slips)
+      full[1] = from[0], full[2] = from[1];
+    else
+      full[0] = from[0], full[1] = -from[1] * e[1], full[2] = from[1] * e[0];
+    from += count;
+    if (f->kind0[i] == SLIP && !slips) {
+      const double *e0 = f->e0 + i * s;
+      c[r++] = full[0];
+      if (f->m > 1) c[r++] = e0[0] * full[2] - e0[1] * full[1];
+    } else {
+      const int skip = f->kind0[i] == SLIP;
+      for (int b = 0; b < width(f, slips, f->kind0[i]); b++) c[r++] = full[skip + b];
     }
   }
-  for (int i = 0; i < f->k; i++) {
-    const double *e = f->e0 + i * s, *h = b + i * s, *G = g + i * s;
-    if (f->kind0[i] == OPEN) continue;
-    c[r++] = some ? h[0] - G[0] : h[0];
-    if (f->kind0[i] == STICK)
-      for (int a = 1; a < s; a++) c[r++] = h[a] - G[a];
-    else if (f->m > 1) c[r++] = e[0] * h[2] - e[1] * h[1] - e[2] * (e[0] * G[2] - e[1] * G[1]);
-  }
   if (f->single) {
-    for (int j = 0; j < f->size; j++) low[j] = (float)c[j];
-    back_in_float(f->size, f->LU_single, f->pivot, low);
-    for (int j = 0; j < f->size; j++) c[j] = low[j];
+    for (int j = 0; j < r; j++) low[j] = (float)c[j];
+    back_in_float(r, f->LU_single, f->pivot, low);
+    for (int j = 0; j < r; j++) c[j] = low[j];
   } else {
-    back_in_double(f->size, f->LU, f->pivot, c);
+    back_in_double(r, f->LU, f->pivot, c);
   }
-  r = 0;
   for (int i = 0; i < f->k; i++) {
-    const double *e = f->e0 + i * s, *own = known + i * s;
-    double *to = b + i * s;
-    memcpy(to, own, s * sizeof(double));
-    if (f->kind0[i] == OPEN) continue;
-    to[0] = c[r++];
-    if (f->kind0[i] == STICK)
-      for (int a = 1; a < s; a++) to[a] = c[r++];
-    else
-      for (int a = 0; a < f->m; a++) to[1 + a] += f->mu[i] * to[0] * e[a];
-    if (f->kind0[i] == SLIP && f->m > 1) to[1] -= c[r] * e[1], to[2] += c[r++] * e[0];
+    const double *e = f->e + i * s;
+    const int kind = f->kind[i], count = width(f, slips, kind), had = lengthen(f, slips, i, f->kind0[i], f->e0 + i * s, c, full);
+    c += had;
+    if (had && kind == SLIP && !slips) {
+      z[0] = full[0];
+      if (f->m > 1) z[1] = e[0] * full[2] - e[1] * full[1];
+    } else if (had) {
+      for (int b = 0; b < count; b++) z[b] = full[b + (kind == SLIP)];
+    } else if (!slips || kind == OPEN) {
+      for (int b = 0; b < count; b++) {
+        const int a = i * s + (kind == SLIP && b ? 1 : b);
+        z[b] = g[b] / (slips ? diagonal(f, a) * f->inverse[(size_t)a * K + a] : diagonal(f, a));
+      }
+    } else {
+      for (int a = 0; a < f->m; a++) {
+        row_of(f, slips, i, kind, e, a, of_v, of_u);
+        for (int b = 0; b < f->m; b++) {
+          own[a][b] = of_u[1 + b];
+          for (int d = 0; d < s; d++) own[a][b] += of_v[d] * f->inverse[(size_t)(i * s + d) * K + i * s + 1 + b];
+        }
+      }
+      const double det = f->m > 1 ? own[0][0] * own[1][1] - own[0][1] * own[1][0] : own[0][0];
+      z[0] = f->m > 1 ? (own[1][1] * g[0] - own[0][1] * g[1]) / det : g[0] / det;
+      if (f->m > 1) z[1] = (own[0][0] * g[1] - own[1][0] * g[0]) / det;
+    }
+    g += count;
+    z += count;
   }
 }

@@ -16,10 +16,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dsymv
 
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles import HalfSpace
-from softgrasp.fem.obstacles.coulomb import OPEN, STICK, Coulomb
+from softgrasp.fem.obstacles.coulomb import Coulomb
+from softgrasp.fem.obstacles.inverse import Inverse
+from softgrasp.fem.obstacles.newton import OPEN, STICK
 from softgrasp.fem.obstacles.obstacle import Obstacle
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.contact.flat import FlatContact
@@ -71,11 +74,11 @@ def rubbing_impulse(
         still: velocity that is rounding [m/s].
     """
     before = v.ravel()
-    pushed = np.multiply(x, contact.dt, out=jolt.x)
-    q = before - A @ pushed.ravel()
-    pushed = pushed.copy()
-    y = (jolt.solve(len(x), A, q, mu, still) - pushed).ravel()
-    taken = -y * (before + A @ y / 2)
+    pushed = contact.dt * x
+    jolt.x[:], jolt.y[:] = pushed, v
+    q = before - dsymv(1.0, A.T, pushed.ravel())
+    y = (jolt.solve(len(x), A, q, mu, still, known=True) - pushed).ravel()
+    taken = -y * (before + jolt.y.ravel()) / 2
     along = float(taken[:: v.shape[1]].sum())
     across = float(taken.sum()) - along
     if across - rubbed < 0:
@@ -199,6 +202,7 @@ class Side:
 
     Args:
         tangents: of a node.
+        inverse: of N S^-1 N', which all sides share.
 
     Attributes:
         coulomb: problem of the steps.
@@ -207,13 +211,20 @@ class Side:
         A: N M^-1 N' of these rows, (k d, k d).
     """
 
-    def __init__(self, tangents: int) -> None:
-        self.coulomb, self.jolt = Coulomb(tangents), Coulomb(tangents)
+    def __init__(self, tangents: int, inverse: Inverse) -> None:
+        self.coulomb, self.jolt = Coulomb(tangents, inverse=inverse), Coulomb(tangents)
         self.stopped, self.A = np.zeros(0, dtype=np.intp), np.zeros((0, 0))
 
-    def stop(self, rows: Ints, A: Array) -> None:
-        """Room for impulses on other rows, of all N M^-1 N'; while they stay, their problem keeps its factor."""
-        self.stopped, self.A = rows, np.ascontiguousarray(A[np.ix_(rows, rows)])
+    def stop(self, rows: Ints, A: Array, other: Side) -> None:
+        """Room for impulses on other rows, of all N M^-1 N'; while they stay, their problem keeps its factor.
+
+        What belongs to the rows alone is shared with the other side where its rows are the same.
+        """
+        if np.array_equal(rows, other.stopped):
+            self.A, self.jolt.inverse = other.A, other.jolt.inverse
+        else:
+            self.A, self.jolt.inverse = np.ascontiguousarray(A[np.ix_(rows, rows)]), Inverse()
+        self.stopped = rows
         self.jolt.fit(len(rows) // (1 + self.jolt.m))
 
 
@@ -223,7 +234,8 @@ class FlatFriction(FlatContact):
     def __init__(self, model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> None:
         self.mu = np.array([entry.friction for entry in model.scene.obstacle or []])
         d = 3 if len((model.scene.obstacle or [])[0].normal or []) == 3 else 2
-        self.sides = Side(d - 1), Side(d - 1)
+        inverse = Inverse()
+        self.sides = Side(d - 1, inverse), Side(d - 1, inverse)
         super().__init__(model, midpoint, steps, hand)
 
     @property
@@ -276,7 +288,7 @@ class FlatFriction(FlatContact):
         if on[-1] >= self.f.struck:
             self.stops.enter()
         if not np.array_equal(on, side.stopped):
-            side.stop(on, self.stops.A)
+            side.stop(on, self.stops.A, self.sides[1 - self.n % 2])
             side.jolt.kind[:], side.jolt.e[:] = side.coulomb.kind[nodes], side.coulomb.e[nodes]
         x, before, rubbed = self.x[on].reshape(-1, s), -self.rates[on].reshape(-1, s), self.c.softgrasp_rubbed(self.f)
         y = rubbing_impulse(self, side.jolt, x, rubbed, self.friction[nodes], side.A, before, self.f.still)
@@ -305,5 +317,5 @@ class FlatFriction(FlatContact):
         for side, coulomb, stopped, jolt in zip(self.sides, sets[1::3], sets[2::3], sets[3::3], strict=True):
             side.coulomb.resume(coulomb, self.W, self.friction)
             if len(rows := stopped.astype(np.intp)):
-                side.stop(rows, self.stops.A)
+                side.stop(rows, self.stops.A, self.sides[1 - self.sides.index(side)])
                 side.jolt.resume(jolt, side.A, self.mu[self.row[rows[:: self.d], 0]])
