@@ -12,11 +12,11 @@ class ObstaclesEffect(Effect):
     name = "obstacles"
     threshold = 0.0
     term = "N'x with 0 <= x, g >= 0, x'g = 0 on the boundary, and an inelastic impulse at touch"
-    cost = "A look at the gaps in every step, one solve for a node that touches, a small problem in a step of contact."
+    cost = "A look at the gaps in every step, up to a solve for a node that touches, a small problem in a contact step."
 
     def operators(self, scene: Scene) -> tuple[str, ...]:
         """Responses to boundary forces, made as nodes touch."""
-        return ("columns of S^-1 N'",) if self.active(scene) else ()
+        return ("columns of S^-1 N', or of their first sweep",) if self.active(scene) else ()
 
     def gate(self, problem: Problem) -> Gate:
         """Number of obstacles; only a run determines whether the tissue gets there."""

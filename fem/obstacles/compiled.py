@@ -10,7 +10,7 @@ import numpy as np
 from softgrasp.fem.strain.compiled import library
 
 SOURCE = Path(__file__).with_name("contact.c")
-HEADERS = tuple(SOURCE.with_name(name) for name in ("dense.h", "flat.h", "pivots.h", "rub.h", "triangle.h"))
+HEADERS = tuple(SOURCE.with_name(name) for name in ("dense.h", "flat.h", "pivots.h", "rub.h", "swept.h", "triangle.h"))
 RIDGE = 1e-13  # share of the diagonal that makes equal rows share their force [1]
 RETRIES = 3  # rounds without progress before rows change sides one by one
 KINDS = {
@@ -28,23 +28,25 @@ def compiled(source: Path, declaration: str) -> Any:
 
 def contact_library() -> Any:
     """See `compiled`, of `contact.c`."""
-    code = SOURCE.with_name("flat.h").read_text()
-    return compiled(SOURCE, code[code.index("typedef struct {") :] + DECLARATIONS)
+    return compiled(SOURCE, _struct("swept.h", "Swept") + _struct("flat.h", "Flat") + DECLARATIONS)
 
 
 def friction_library() -> Any:
     """See `compiled`, of `friction.c`."""
-    source = SOURCE.with_name("friction.c")
-    code = SOURCE.with_name("rub.h").read_text()
-    struct = code[code.index("typedef struct {") : code.index("} Rub;")] + "} Rub;\n"
-    return compiled(source, struct + RUB_DECLARATIONS)
+    return compiled(SOURCE.with_name("friction.c"), _struct("rub.h", "Rub") + RUB_DECLARATIONS)
 
 
-DONE, TAKE, ENTER, BALANCE, SOLVE, UNSOLVED, UNSETTLED = range(7)  # what a step needs before it goes on
+def _struct(header: str, name: str) -> str:
+    code, end = SOURCE.with_name(header).read_text(), f"}} {name};\n"
+    return code[code.index("typedef struct {") : code.index(end)] + end
+
+
+DONE, TAKE, ENTER, BALANCE, SOLVE, SWEEP, UNSOLVED, UNSETTLED = range(8)  # what a step needs before it goes on
 DECLARATIONS = """
 int softgrasp_complement(int p, int ld, const double *W, const double *q, double tol, int most,
   int *count, int *order, double *L, double *x, int *side, double *room, long *tally);
 double softgrasp_look(const Flat *f);
+void softgrasp_products(const Swept *s, int j, double *to);
 void softgrasp_values(const Flat *f, double *to);
 void softgrasp_refresh(const Flat *f);
 double softgrasp_rubbed(const Flat *f);

@@ -33,6 +33,15 @@ double softgrasp_look(const Flat *f) {
   return most;
 }
 
+/* z = D x for a column x, or for y. Products of column j with those up to it. */
+void softgrasp_products(const Swept *s, int j, double *to) {
+  for (int i = 0; i < s->reached; i++)
+    for (int a = 0; a < s->d; a++) s->z[s->nodes[i] * s->d + a] = 0;
+  softgrasp_add(s, j, 1, s->z);
+  softgrasp_scale(s, s->z);
+  for (int k = 0; k <= j; k++) to[k] = softgrasp_times(s, k);
+}
+
 /* Half the gap of a row at the end of the step, or half its slip in the step. */
 static double value(const Flat *f, int j) {
   const int *row = f->row + 4 * j;
@@ -83,6 +92,28 @@ static void add_to_r(const Flat *f, int j, double t) {
   }
 }
 
+/* The same right-hand side from the first sweep of a step without forces; whether a row has a negative gap. */
+static int foresee(const Flat *f) {
+  int negative = 0;
+  memset(f->x, 0, f->k * sizeof(double));
+  softgrasp_scale(f->swept, f->swept->y);
+  for (int k = 0; k < f->count_columns; k++) f->change[k] = softgrasp_times(f->swept, k);
+  for (int j = 0; j < f->k; j++) {
+    const int *row = f->row + 4 * j, o = row[0];
+    const double *e = along(f, row);
+    double way = row[3] == 0 ? -f->level[o] : 0;
+    for (int a = 0; a < f->d; a++) {
+      const int u = row[1] * f->d + a;
+      double x = row[3] == 0 ? f->X[u] + f->z[u] : -f->slide[o * f->d + a];
+      for (int k = 0; k < f->n_s; k++) x += f->T[(size_t)u * f->n_s + k] * (f->q[k] - (row[3] == 0 ? 0 : f->q0[k]));
+      way += e[a] * x;
+    }
+    f->free[j] = way / 2 + f->change[row[2]];
+    negative |= row[3] == 0 && f->free[j] < 0;
+  }
+  return negative;
+}
+
 /* Take forces x instead of those before into r; by how much they change into `change`. Returns how many do. */
 static int take(const Flat *f, const double *x) {
   int changes = 0;
@@ -98,8 +129,11 @@ static int take(const Flat *f, const double *x) {
   return changes;
 }
 
-/* Take these changes into w, four columns in a pass. */
+/* Take these changes into w, four columns in a pass, or into y. */
 static void apply(const Flat *f) {
+  for (int k = 0; f->swept && k < f->count_columns; k++)
+    if (f->change[k] != 0) softgrasp_add(f->swept, k, f->change[k], f->swept->y);
+  if (f->swept) return;
   const double *c[4];
   double t[4];
   int m = 0;
@@ -128,7 +162,7 @@ double softgrasp_rubbed(const Flat *f) {
 /* Tables of step n: force and number of pressed nodes of each half-space, T'N'x, and energies. */
 static void account(const Flat *f, int n) {
   double *force = f->force + (size_t)n * f->obstacles * f->d, *touching = f->touching + (size_t)n * f->obstacles;
-  double *hand = f->hand + (size_t)n * f->n_s;
+  double *hand = f->hand + (size_t)n * f->n_s, energy[4] = {0}; /* of the step, or rounding of the sums would add up */
   for (int j = 0; j < f->k; j++) {
     const int *row = f->row + 4 * j, o = row[0], i = row[1];
     if (!(f->x[j - row[3]] > 0)) continue;
@@ -138,11 +172,12 @@ static void account(const Flat *f, int n) {
       double x = f->x[j] * e[a];
       force[o * f->d + a] += x;
       for (int k = 0; k < f->n_s; k++) hand[k] += f->T[(size_t)(i * f->d + a) * f->n_s + k] * x;
-      f->energy[0] += 2 * x * f->moved[i * f->d + a];
+      energy[0] += 2 * x * f->moved[i * f->d + a];
     }
-    if (row[3] == 0) f->energy[1] += f->x[j] * f->gap[(size_t)o * f->p + i];
-    else f->energy[3] -= f->x[j] * 2 * value(f, j);
+    if (row[3] == 0) energy[1] += f->x[j] * f->gap[(size_t)o * f->p + i];
+    else energy[3] -= f->x[j] * 2 * value(f, j);
   }
+  for (int k = 0; k < 4; k++) f->energy[k] += energy[k];
 }
 
 /* Carry the boundary on to the end of step n; r takes N'x once more, as it takes G c. */
@@ -165,7 +200,8 @@ static void push(const Flat *f, int n) {
   for (int i = 0; i < m; i++) a[i] = dot(m, f->inverse + i * m, b);
   for (int i = 0; i < m; i++) {
     const double c = f->kappa * a[i], *Y = f->Y + (size_t)i * f->n, *G = f->G + (size_t)i * f->n;
-    for (int u = 0; u < f->n; u++) f->w[u] -= Y[u] * c;
+    double *w = f->swept ? f->swept->y : f->w;
+    for (int u = 0; u < f->n; u++) w[u] -= Y[u] * c;
     for (int u = 0; u < f->n; u++) f->r[u] -= G[u] * c;
     f->cs[(size_t)n * m + i] -= c;
     f->vs[(size_t)(n + 1) * m + i] += f->dt * a[i];
@@ -182,10 +218,17 @@ int softgrasp_step(Flat *f, int n) {
         f->q = f->q0 + f->n_s;
         f->stage = UNTOUCHED;
         f->round = f->pressed = 0;
+        if (f->ahead) {
+          f->tol = f->rounding * (f->largest + f->extent);
+          f->pressed = foresee(f);
+          if (!f->pressed) return SWEEP;
+          f->stage = ROWS;
+          break;
+        }
         if (!f->whole) return TAKE;
         break;
       case UNTOUCHED:
-        f->tol = f->rounding * (softgrasp_look(f) + f->extent);
+        f->tol = f->rounding * ((f->largest = softgrasp_look(f)) + f->extent);
         for (int o = 0; o < f->obstacles; o++) f->pressed |= f->least[o] < 0;
         if (!f->pressed) return DONE;
         begin(f);
@@ -202,16 +245,17 @@ int softgrasp_step(Flat *f, int n) {
         break;
       case FORCES:
         f->stage = TAKEN;
-        if ((double)take(f, f->to) * f->n > f->entries) return SOLVE;
+        if ((double)take(f, f->to) * f->n > f->entries && !f->swept) return SOLVE;
         apply(f);
         break;
       case TAKEN:
         if (f->feels) push(f, n);
         f->stage = AFTER;
+        if (f->swept) return SWEEP;
         if (!f->whole) return TAKE;
         break;
       default:
-        softgrasp_look(f);
+        f->largest = softgrasp_look(f);
         f->stage = ROWS;
         f->depth = f->tol;
         const int more = missing(f, f->tol, &reached);

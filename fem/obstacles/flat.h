@@ -1,8 +1,8 @@
 /* The step before half-spaces, see contact.c: its data, and what it needs before it goes on. */
-#include "dense.h"
+#include "swept.h"
 
 enum { MODES = 8 }; /* freedoms of a hand, at most */
-enum { DONE, TAKE, ENTER, BALANCE, SOLVE, UNSOLVED, UNSETTLED };
+enum { DONE, TAKE, ENTER, BALANCE, SOLVE, SWEEP, UNSOLVED, UNSETTLED };
 enum { BEGIN, UNTOUCHED, ROWS, FORCES, TAKEN, AFTER };
 
 typedef struct {
@@ -37,12 +37,16 @@ typedef struct {
   double *free, *x, *b;     /* right-hand side of the small problem, forces, velocities to stop (k) */
   double *change;           /* what the last forces added to that of each column */
   double entries;           /* that a solve reads: where columns have more, it is taken instead of them */
-  const double *B, *Y, *G;  /* of a hand that feels the tissue: directions times reach (columns, n_s), S^-1 G, G (n_s, n) */
+  const Swept *swept;       /* F N' instead of S^-1 N', or 0 */
+  int ahead;                /* whether y is known in the place of w when a step begins */
+  const double *B, *Y, *G;  /* of a hand that feels the tissue: directions times reach (columns, n_s), S^-1 G, or F G, and G
+                               (n_s, n) */
   const double *inverse;    /* L^-1 of its equation (n_s, n_s) */
   int *count, *order, *side; /* small problem, see `softgrasp_complement` */
   double *L, *to, *room;
   long *tally;
   int stage, round, pressed; /* where the step is, its rounds, whether a row may be pressed */
+  double largest;           /* coordinate at the last look */
   double tol, depth, reached; /* tolerance of gaps, depth from which pairs enter, largest gap of pressed rows */
   double fastest, still;    /* largest velocity of a pressed node so far, and what is at rest against it */
   int struck, stopping;     /* rows with a column of M^-1, and rows of the factor LA */

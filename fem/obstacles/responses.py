@@ -14,6 +14,13 @@ Key = tuple[int, int]
 TOGETHER = 16  # columns of one call, which MUMPS solves as one block
 
 
+def larger(x: Array, shape: tuple[int, ...], order: Literal["C", "F"] = "C") -> Array:
+    """An array of a larger shape that begins with x, zero beyond."""
+    y = np.zeros(shape, x.dtype, order)
+    y[tuple(slice(n) for n in x.shape)] = x
+    return y
+
+
 class Responses:
     """Responses to unit forces on boundary nodes.
 
@@ -70,37 +77,40 @@ class Responses:
         forces = np.zeros((self.size, len(keys)))
         for j, (node, direction) in enumerate(keys):
             forces[node * self.d : (node + 1) * self.d, j] = self.directions[direction]
-        columns, there = self.respond(forces)
         have, k = self.count, self.count + len(keys)
         if k > len(self.G):
-            self._grow(max(16, 2 * k), len(columns))
+            size = max(16, 2 * k)
+            self.keys, self.G = larger(self.keys, (size, 2)), larger(self.G, (size, size))
+            self.B = larger(self.B, (size, self.B.shape[1]))
         self.keys[have:k] = keys
         self.where.update(zip(keys, range(have, k), strict=True))
-        self.columns[:, have:k], self.surface[:, have:k] = columns, there
+        self._solve(have, forces)
         for j in range(have, k):
             self._relate(j)
 
+    def _solve(self, first: int, forces: Array) -> None:
+        """The columns from ``first`` on, of forces (p d, k). Collective."""
+        columns, there = self.respond(forces)
+        new = slice(first, first + forces.shape[1])
+        if self.columns.shape[1] < len(self.G):
+            self.columns = larger(self.columns, (len(columns), len(self.G)), "F")
+            self.surface = larger(self.surface, (self.size, len(self.G)), "F")
+        self.columns[:, new], self.surface[:, new] = columns, there
+
     def _relate(self, j: int) -> None:
         """Products of column j with those before it."""
-        nodes, numbers = self.keys[: j + 1].T
-        there = self.surface[:, j].reshape(-1, self.d)
-        products = np.einsum("ij,ij->i", self.directions[numbers], there[nodes])
+        products, (node, number) = self._products(j), self.keys[j]
         if self.reach is not None:
             reach, inverse = self.reach
-            self.B[j] = self.directions[numbers[j]] @ reach[nodes[j] * self.d : (nodes[j] + 1) * self.d]
+            self.B[j] = self.directions[number] @ reach[node * self.d : (node + 1) * self.d]
             products = products + self.B[: j + 1] @ (inverse @ self.B[j])
         self.G[j, : j + 1] = self.G[: j + 1, j] = products
 
-    def _grow(self, size: int, rows: int) -> None:
-        def larger(x: Array, shape: tuple[int, int], order: Literal["C", "F"] = "C") -> Array:
-            y = np.zeros(shape, x.dtype, order)
-            y[: x.shape[0], : x.shape[1]] = x
-            return y
-
-        self.columns = larger(self.columns, (rows, size), "F")
-        self.surface = larger(self.surface, (self.size, size), "F")
-        self.keys, self.G = larger(self.keys, (size, 2)), larger(self.G, (size, size))
-        self.B = larger(self.B, (size, self.B.shape[1]))
+    def _products(self, j: int) -> Array:
+        """N S^-1 n of column j for the columns up to it."""
+        nodes, numbers = self.keys[: j + 1].T
+        there = self.surface[:, j].reshape(-1, self.d)
+        return np.asarray(np.einsum("ij,ij->i", self.directions[numbers], there[nodes]))
 
     def forces(self, f: Array) -> Array:
         """Forces on the boundary (p d,) of strengths f (count,)."""

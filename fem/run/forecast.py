@@ -82,7 +82,7 @@ def forecast(
     if first:  # both are there at once
         memory += static.memory(static.solver(requested))
     if touching is not None:
-        memory += touching.memory(n, ranks, work.copies(name))
+        memory += touching.memory(n, ranks, work.copies(name), name)
     return Forecast(
         ranks=ranks,
         solver=name,
@@ -95,7 +95,7 @@ def forecast(
         memory=memory,
         contact=0.0
         if touching is None
-        else touching.seconds(n, work.solve(name), work.solves, factor_bytes(name, n, d, 1.0)),
+        else touching.seconds(n, work.solve(name), work.solves, factor_bytes(name, n, d, 1.0), name),
     )
 
 

@@ -66,6 +66,19 @@ class HandStep:
         self.midpoint.accelerate(self.kappa * a + c_0)
         return np.asarray(a)
 
+    def feel_before(self) -> None:
+        """Let a two-way hand feel the tissue by G'S^-1 h = Y'h, before the solve, which may then end later."""
+        self.push = self._two_way_before
+
+    def _two_way_before(self, v: Array, u: Array, state: TissueState) -> Array:
+        """As `_two_way`, where every rank has all rows. Collective."""
+        system, midpoint, c_0 = self.system, self.midpoint, self.alpha * v - self.g
+        pull = self.theta * (midpoint.Y.T @ midpoint.r_array + self.GY @ (midpoint.pending - c_0))
+        pull -= self.s * total(self.comm, system.G.T @ state.array[system.layout.n_local :])
+        a = self.inverse @ (u + self.weight - system.M_rigid @ c_0 - pull)
+        midpoint.solve_midpoint(-(self.kappa * a + c_0))
+        return np.asarray(a)
+
     def _inexact(self, v: Array, u: Array, state: TissueState) -> Array:
         """As `_two_way`, where w is scaled so that its residual does no work. Collective."""
         system, c_0 = self.system, self.alpha * v - self.g

@@ -1,7 +1,12 @@
-"""What contact needs in a run, estimated before it: as many columns as nodes are on the way of the undeformed body."""
+"""What contact needs in a run, estimated before it: as many columns as nodes are on the way of the undeformed body.
+
+Before half-spaces with a Cholesky in blocks a column has entries on the ancestors of its node in the elimination tree
+alone, and is read twice in a step of contact; else it has all rows and is read once, or a second solve is taken.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +17,14 @@ from softgrasp.fem.obstacles import HalfSpace, Obstacle, make_obstacles
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import motion_table
 from softgrasp.fem.run.snapshots import spread
+from softgrasp.fem.solve.costs import SolverName
 
 INSTANTS = 200  # of a prescribed motion, at which gaps are computed
 REACHED = {2: 4000, 3: 40_000}  # nodes that a column of M^-1 reaches before rounding, by dimension [1]
 MASS = {2: 2e-7, 3: 7e-7}  # time of such a column, by dimension [s a node that it reaches]
+# Ancestors of a node in nested dissection over the nodes of a cut, (nodes)^(1 - 1/d): 2.1 to 2.8 and 1.9 to 2.2 were
+# counted for nodes of the lower edge or face, with 400 to 20 200 and 441 to 6615 nodes [1].
+ANCESTORS = {2: 2.7, 3: 2.1}
 SQUARES = 5  # matrices over the rows, W = N S^-1 N', its factor, those of impulses, and room for twice the rows
 
 
@@ -27,19 +36,32 @@ class ExpectedContact:
     columns: int  # of S^-1 N' [1]
     surface: int  # unknowns of the boundary [1]
     dimension: int  # axes [1]
+    flat: bool  # whether there are half-spaces alone
 
-    def memory(self, n: int, ranks: int, copies: float) -> float:
+    def memory(self, n: int, ranks: int, copies: float, solver: SolverName) -> float:
         """Memory over all ranks [byte] with n unknowns, of which ``copies`` are kept."""
-        columns = 8.0 * self.columns * (copies * n + ranks * self.surface)
-        return columns + ranks * (24.0 * self.nodes * self._reached(n) + SQUARES * 8.0 * (2 * self.columns) ** 2)
+        rows = ranks * self._ancestors(n) if self._swept(solver) else copies * n + ranks * self.surface
+        return 8.0 * self.columns * rows + ranks * (
+            24.0 * self.nodes * self._reached(n) + SQUARES * 8.0 * (2 * self.columns) ** 2
+        )
 
-    def seconds(self, n: int, solve: float, steps: int, factor: float) -> float:
-        """Time of first touches, a solve of ``solve`` [s] each, and of all steps in contact [s], at most.
+    def seconds(self, n: int, solve: float, steps: int, factor: float, solver: SolverName) -> float:
+        """Time of first touches and of all steps in contact [s], at most; solve: time of one with ``factor`` bytes [s].
 
-        A step in contact reads the columns, or takes one more solve with a factor of ``factor`` bytes.
+        The first touch of a column needs a solve, or the half of one.
         """
-        step = solve * min(1.0, 8.0 * self.columns * n / max(2 * factor, 1.0))
-        return self.columns * solve + self.nodes * self._reached(n) * MASS[self.dimension] + steps * step
+        swept = self._swept(solver)
+        read = 2 * self._ancestors(n) if swept else n
+        step = solve * min(1.0, 8.0 * self.columns * read / max(2 * factor, 1.0))
+        touches = self.columns * solve * (0.5 if swept else 1.0)
+        return touches + self.nodes * self._reached(n) * MASS[self.dimension] + steps * step
+
+    def _swept(self, solver: SolverName) -> bool:
+        return self.flat and solver == "cholesky"
+
+    def _ancestors(self, n: int) -> float:
+        d = self.dimension
+        return min(n, ANCESTORS[d] * d * math.pow(n / d, 1 - 1 / d))
 
     def _reached(self, n: int) -> int:
         return min(n // self.dimension, REACHED[self.dimension])
@@ -65,7 +87,8 @@ def expected_contact(model: Model, n: int | None = None) -> ExpectedContact | No
     finer = ((n or layout.n_e) / layout.n_e) ** ((d - 1) / d)
     columns = int(touching.sum(axis=1) @ np.where(straight, 1, d))
     nodes = int(touching.any(axis=0).sum())
-    return ExpectedContact(round(finer * nodes), round(finer * columns), round(finer * surface.X.size), d)
+    flat = all(isinstance(o.shape, HalfSpace) for o in obstacles)
+    return ExpectedContact(round(finer * nodes), round(finer * columns), round(finer * surface.X.size), d, flat)
 
 
 def nearest_gaps(

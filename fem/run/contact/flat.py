@@ -1,8 +1,10 @@
 """Contact before half-spaces, whose normals stay: `contact.c` looks at the gaps and takes the forces in.
 
 Every pair of half-space and node keeps its row in W = N S^-1 N' from the step in which it first meets, so that the
-small problem keeps its factor as long as the set of pressed rows stays. A step that touches costs a pass over the
-columns S^-1 N' of the pressed nodes beside the step without contact.
+small problem keeps its factor as long as the set of pressed rows stays. With a Cholesky in blocks, S^-1 = B F, a step
+that touches is one solve: between its sweeps the gaps of these rows are known, N w = (F N')'D F r, and the forces
+enter, F r + F N'x (`softgrasp.fem.solve.sweeps`). With other solvers a step costs a pass over the columns S^-1 N' of
+the pressed nodes beside the step without contact.
 """
 
 from __future__ import annotations
@@ -15,14 +17,18 @@ from numpy.typing import NDArray
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles import HalfSpace
-from softgrasp.fem.obstacles.compiled import BALANCE, DONE, ENTER, KINDS, SOLVE, TAKE, UNSETTLED, contact_library
-from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.obstacles.compiled import BALANCE, DONE, ENTER, KINDS, SOLVE, SWEEP, TAKE, UNSETTLED, contact_library
+from softgrasp.fem.obstacles.responses import Responses
+from softgrasp.fem.obstacles.swept import SweptResponses
+from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.run.contact.general import MOST, ROUNDING, STILL, Contact, unsettled
 from softgrasp.fem.run.contact.rows import Ints, Rows
 from softgrasp.fem.run.contact.stops import Stops
+from softgrasp.fem.run.contact.touching import Touching
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import Driven
+from softgrasp.fem.solve.sweeps import sweeps_of
 
 READS = 2  # of every entry of the factor by a solve
 
@@ -54,6 +60,33 @@ class FlatContact(Contact):
     @fastest.setter
     def fastest(self, speed: float) -> None:
         self.f.fastest = speed
+
+    def _make_responses(self) -> Responses:
+        """See :meth:`Contact._make_responses`: first sweeps alone, where one rank has the whole factor. Collective."""
+        made, solver = super()._make_responses(), self.midpoint.solver
+        self.sweeps = sweeps_of(solver, self.d) if self.whole and self.surface.B is None else None
+        if self.sweeps is None:
+            return made
+        code, D = (self.ffi, self.c), self.sweeps.D
+        swept = SweptResponses(made.directions, self._respond_ahead, made.size, made.reach, D, code)
+        self.swept = PETSc.Vec().createWithArray(swept.y, comm=PETSc.COMM_SELF)
+        return swept
+
+    def _respond_ahead(self, forces: Array) -> tuple[Array, Array]:
+        """F of forces (p d, k) on the boundary."""
+        b = np.zeros((len(self.b.array_r), forces.shape[1]), order="F")
+        b[self.places] = forces[self.order]
+        return self._ahead(b), b[:0]
+
+    def _ahead(self, b: Array) -> Array:
+        """F b of columns (n, k)."""
+        assert self.sweeps is not None
+        y = np.empty(b.shape, order="F")
+        for j in range(b.shape[1]):
+            self.b.array_w[:] = b[:, j]
+            self.sweeps.forward(self.b, self.y)
+            y[:, j] = self.y.array_r
+        return y
 
     def _axes(self) -> Array:
         """Directions of the rows of a pair, the normal first, (obstacles, rows, d)."""
@@ -112,7 +145,7 @@ class FlatContact(Contact):
         z[:], self.moved[:], self.q[:], self.f.whole = self.z, 0.0, q, False
         self._place(n)
         self.point(q=self.q, q0=self.q)
-        self.c.softgrasp_look(self.f)  # the bits of a run that is not restarted here
+        self.f.largest = self.c.softgrasp_look(self.f)  # the bits of a run that is not restarted here
         gaps[:], self.z, self.gaps, self.f.whole = self.after, z, gaps, whole
         self.table.gap[n] = self.least
 
@@ -140,6 +173,8 @@ class FlatContact(Contact):
                 self.point(to=self._balance(f.tol / 4))
             elif wanted == SOLVE:
                 self._solve()
+            elif wanted == SWEEP:
+                self._sweep()
             else:
                 raise unsettled(f.reached) if wanted == UNSETTLED else SolverError(self.small.unsolved(f.k))
         if not f.pressed:
@@ -159,6 +194,29 @@ class FlatContact(Contact):
         self.midpoint.solver.solve(self.b, self.y)
         self.midpoint.w.axpy(1.0, self.y)
 
+    def lead(self) -> None:
+        """See :meth:`Contact.lead`."""
+        if not self.f.swept or self.f.ahead:
+            return
+        sweeps, y = self.sweeps, self.swept
+        assert sweeps is not None
+        assert isinstance(self.midpoint, Touching)
+        self.f.ahead = True
+        self.midpoint.solve_by(lambda r, w: sweeps.forward(r, y))
+        if self.hand is not None:
+            self.hand.feel_before()
+
+    def _sweep(self) -> None:
+        """Take y into w by the second sweep."""
+        assert self.sweeps is not None
+        assert isinstance(self.responses, SweptResponses)
+        if self.f.ahead:
+            self.sweeps.backward(self.swept, self.midpoint.w)
+            return
+        self.sweeps.backward(self.swept, self.y)
+        self.midpoint.w.axpy(1.0, self.y)
+        self.responses.y[:] = 0.0
+
     def _balance(self, tol: float) -> Array:
         """Forces of the rows that leave no gap below -tol."""
         return self.small.solve(self.f.k, self.W, self.free, tol)
@@ -175,7 +233,13 @@ class FlatContact(Contact):
         if k > len(self.W):
             self._grow(max(16, 2 * k), have)
         self.f.k, self.f.count_columns = k, self.responses.count
-        self.point(row=self.row, columns=self.responses.columns.T, B=self.responses.B)
+        self.point(row=self.row, B=self.responses.B)
+        if not isinstance(self.responses, SweptResponses):
+            self.point(columns=self.responses.columns.T)
+        elif not self.f.swept:
+            self.f.swept = self.responses.f
+            if self.hand is not None:
+                self.point(Y=np.ascontiguousarray(self._ahead(self.midpoint.G).T))
         every = self.row[:, 2]
         G = self.responses.G[np.ix_(every, every[have:])]
         self.W[:k, have:k], self.W[have:k, :k] = G, G.T

@@ -162,6 +162,9 @@ class Contact:
                 f"{-self.gaps[o, i]:.3g} m deep; move it, or start elsewhere"
             )
 
+    def lead(self) -> None:
+        """Let a step leave the second half of its solve to `press`, where that saves time."""
+
     def press(self, n: int, drive: Driven) -> None:
         """Turn the step without contact in the midpoint into one that leaves no penetration. Collective.
 

@@ -28,6 +28,7 @@ class ContactDrive:
 
     def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
         """One step. Collective."""
+        self.contact.lead()
         self.drive.solve(n, midpoint, state)
         self.contact.press(n, self.drive)
 

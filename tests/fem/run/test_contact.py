@@ -36,6 +36,7 @@ TWO = ["effects.reaction=true", "motion={profile='hold', drive='force'}", "hand=
 SHORT = ["time.steps=130", "time.end=1.3"]
 DISC = "obstacle=[{kind='disc', center=[0.4, -0.53], radius=0.5}]"
 BOX = "obstacle=[{kind='box', lo=[0.1, -0.53], hi=[2, -0.03], path={velocity=[0, 0.02]}}]"
+RUBBING = TABLE.replace("name=", "friction=0.3, name=")
 SLANTED = (
     "obstacle=[{kind='halfspace', normal=[0.1, 1], offset=-0.03}, {kind='halfspace', normal=[0, 1], offset=-0.04}]"
 )
@@ -323,18 +324,23 @@ def test_compiled_half_spaces_are_those_of_the_general_step(
 
 
 @pytest.mark.ranks(3)
-@pytest.mark.parametrize("reproducible", ["true", "false"])
-def test_forces_are_taken_in_by_a_solve_as_by_columns(reproducible: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = build("paper_forward", [*SMALL, ON, TABLE, SPACE, *TWO, *SHORT, f"time.reproducible={reproducible}"])
+@pytest.mark.parametrize("overrides", [[TABLE, SPACE, *TWO], [SLANTED, BETA], [RUBBING, SPACE, *TWO]])
+def test_forces_enter_between_the_sweeps_of_a_solve_as_by_columns_or_another_solve(
+    overrides: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = build("paper_forward", [*SMALL, ON, *overrides, *SHORT])
+    between = simulate(model)
+    monkeypatch.setattr("softgrasp.fem.run.contact.flat.sweeps_of", lambda *_: None)
     columns = simulate(model)
     monkeypatch.setattr("softgrasp.fem.run.contact.flat.READS", 0)
     solved = simulate(model)
-    # two orders of the same sums, over 130 steps in which nodes touch and leave
-    assert np.abs(columns.final - solved.final).max() < 1e-9 * np.abs(solved.final).max()
-    assert np.array_equal(columns.contact.touching, solved.contact.touching)
-    assert not np.array_equal(columns.final, solved.final)  # the way there differs
-    assert solved.energy_drift < 1e-13
-    assert solved.contact.penetration < 1e-13
+    for one in (between, solved):
+        # two orders of the same sums, over 130 steps in which nodes touch and leave
+        assert np.abs(columns.final - one.final).max() < 1e-9 * np.abs(one.final).max()
+        assert np.array_equal(columns.contact.touching, one.contact.touching)
+        assert not np.array_equal(columns.final, one.final)  # the way there differs
+        assert one.energy_drift < 1e-13
+        assert one.contact.penetration < 1e-13
 
 
 @pytest.mark.parametrize(("overrides", "words"), REFUSED)

@@ -70,7 +70,7 @@ def test_a_step_in_contact_makes_no_object_and_its_memory_counts(comm: MPI.Intra
     assert contact is not None
     assert contact.table.touching[:11].sum() > 1  # contact in more than one of the steps that are counted
     assert contact.table.impulse[1:11].any()
-    assert memory_by_object(stepper.run.model, stepper.run)["contact.columns"] == contact.responses.columns.nbytes
+    assert memory_by_object(stepper.run.model, stepper.run)["contact.values"] == contact.responses.values.nbytes
     stepper.destroy()
     at_first, in_steps = objects_of(comm, scene)
     assert in_steps == {}
