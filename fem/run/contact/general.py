@@ -358,8 +358,7 @@ class Contact:
 
     def record(self) -> ContactRecord:
         """The record of the run."""
-        table = self.table
-        work, touch, stopped, rubbed = table.energy.tolist()
+        table, (work, touch, stopped, rubbed) = self.table, self.table.energy.tolist()
         names = tuple(o.name for o in self.obstacles)
         return ContactRecord(
             names, table.force, table.impulse, table.gap, table.touching, work, touch, stopped, rubbed,
