@@ -57,8 +57,8 @@ int softgrasp_stop(Flat *f, int n, double *v);
 """
 RUB_DECLARATIONS = """
 void softgrasp_matrix(Rub *f);
-void softgrasp_begin(Rub *f, int lead, int known);
-int softgrasp_rub(Rub *f, int begin, int rounds, int led);
+void softgrasp_begin(Rub *f, int where, int known);
+int softgrasp_rub(Rub *f, int begin, int rounds);
 void softgrasp_sweep(Rub *f, int sweeps, double still);
 double softgrasp_wrong(Rub *f);
 """

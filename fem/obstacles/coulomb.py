@@ -23,7 +23,7 @@ from scipy.linalg.lapack import dgetrf, sgetrf
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.obstacles.compiled import KINDS, friction_library
-from softgrasp.fem.obstacles.inverse import Inverse
+from softgrasp.fem.obstacles.inverse import NONE, Inverse
 from softgrasp.fem.obstacles.newton import NEARLY, OPEN, ROUNDS, SLIP, STICK, STILL, SWEEPS, Rounds
 
 Array = NDArray[Any]
@@ -31,7 +31,8 @@ KEPT = 24  # steps of a round that are kept, as rub.h says
 SINGLE = 100  # nodes from which factors in 3D are in single precision, in half the time
 LITTLE, GROWTH, LEAST = 0.2, 1.4, 1.04  # first coefficient of friction that grows, by how much it does, and must
 REFINED = 6  # pyramids, each with edges three times as near to the last directions
-FACTOR = "rows", "slips0", "single", "age", "work"  # what the struct knows of its factor
+KNOWN = "rows", "slips0", "single", "age", "work", "slips", "had"  # what a restart needs of the struct
+HERE, OPENED, FIRST = range(3)  # where rounds begin, see friction.c
 SOLVED, WANTED, _, DRIFTED = range(4)  # what `softgrasp_rub` says, see rub.h
 
 
@@ -55,7 +56,6 @@ class Coulomb(Rounds):
         self.m, self.inverse = tangents, inverse or Inverse()
         self.code: Any = None if engine == "NumPy" else friction_library()
         self.tally = np.zeros(3, np.int64)
-        self.had = False  # whether the step before the last had forces
         self.arrays = dict[str, NDArray[Any]]()
         self.f: Any = None if self.code is None else self.code[0].new("Rub *")
         self.x = self.y = self.e = np.zeros((0, 1 + tangents))
@@ -75,7 +75,7 @@ class Coulomb(Rounds):
         x[:have], e[:have], kind[:have] = self.x[:have], self.e[:have], self.kind[:have]
         self.x, self.y, self.e, self.kind = x, y, e, kind
         self.kind0, self.e0 = kind.copy(), e.copy()
-        self.before, self.before_y, self.had = np.zeros((k, s)), np.zeros((k, s)), False
+        self.before, self.before_y = np.zeros((k, s)), np.zeros((k, s))
         if self.code is None:
             return
         K = k * s
@@ -86,7 +86,7 @@ class Coulomb(Rounds):
             e0=self.e0, solved=np.zeros(K), lacks=np.zeros(K), Z=np.zeros((KEPT, K)), C=np.zeros((KEPT, K)),
             room=np.zeros(8 * K), seen=np.zeros((ROUNDS[self.m], k), np.int8), tally=self.tally,
         )  # fmt: skip
-        self.f.k, self.f.m, self.f.rows, self.f.slips = k, self.m, 0, 0
+        self.f.k, self.f.m, self.f.rows, self.f.slips, self.f.had = k, self.m, 0, 0, 0
 
     def _use(self, single: bool) -> None:
         """Room for a factor in single precision or in double."""
@@ -125,10 +125,7 @@ class Coulomb(Rounds):
         """
         if k != len(self.kind):
             self.fit(k)
-        led = first and self._leads()
-        if not led:
-            self.kind[(self.kind == OPEN) & (q[:: 1 + self.m] < 0)] = STICK
-        if not self._attempt(W, q, mu, tol, led, known):
+        if not self._attempt(W, q, mu, tol, FIRST if first else OPENED, known):
             others = (self._pivot, self._grow) if self.m == 1 else (self._grow, self._pivot)
             if not any(other(W, q, mu, tol) for other in others):
                 raise SolverError(
@@ -137,19 +134,12 @@ class Coulomb(Rounds):
                 )
         return self.x
 
-    def _leads(self) -> bool:
-        """Whether the last two steps had forces."""
-        if self.code is None:
-            return False
-        had, self.had = self.had, bool(self.x.any())
-        if not (had and self.had):
-            self.before[:], self.before_y[:] = self.x, self.y
-        return had and self.had
-
-    def _attempt(self, W: Array, q: Array, mu: Array, tol: float, led: bool = False, known: bool = False) -> bool:
+    def _attempt(self, W: Array, q: Array, mu: Array, tol: float, where: int = HERE, known: bool = False) -> bool:
         """Whether rounds and sweeps from the present forces and sets find a solution."""
         if self.code is not None:
-            return self._in_c(W, q, mu, tol, led, known)
+            return self._in_c(W, q, mu, tol, where, known)
+        if where != HERE:
+            self.kind[(self.kind == OPEN) & (q[:: 1 + self.m] < 0)] = STICK
         found = self._in_numpy(W, q, mu, tol)
         self.y[:] = (W[: len(q), : len(q)] @ self.x.ravel() + q).reshape(self.y.shape)
         return found
@@ -200,23 +190,22 @@ class Coulomb(Rounds):
             kept = self.x.copy(), self.kind.copy(), self.e.copy()
         return False
 
-    def _in_c(self, W: Array, q: Array, mu: Array, tol: float, led: bool, known: bool) -> bool:
+    def _in_c(self, W: Array, q: Array, mu: Array, tol: float, where: int, known: bool) -> bool:
         self._describe(W, q, mu, tol)
         kept = self.x.copy(), self.kind.copy(), self.e.copy()
-        if (end := self._rounds(led, known)) == DRIFTED:
-            self.inverse.refuse()
-            self._unknowns(slips=False)
+        end = self._rounds(where, known)
+        if end == DRIFTED:
+            self._refuse()
             self.x[:], self.kind[:], self.e[:] = kept
-            end = self._rounds()
+            end = self._rounds(min(where, OPENED))
         if end == SOLVED:
             return True
-        self._unknowns(slips=False)
         self.code[1].softgrasp_sweep(self.f, SWEEPS, STILL)
         kept = self.x.copy(), self.kind.copy(), self.e.copy()
         for single in (True, False) if self.f.single else (False,):
             if self.f.single != single:  # from now on
                 self._use(single)
-                self._unknowns(slips=False)
+                self._matrices()
             self.f.rows = 0
             if self._rounds() == SOLVED:
                 return True
@@ -231,27 +220,29 @@ class Coulomb(Rounds):
         self.inverse.of(W, len(q))
         self._point(W=W, q=q, mu=mu)
         self.f.ld, self.f.tol = W.shape[1], tol
-        count = np.bincount(self.kind, minlength=3)
-        rather = (2 if self.f.slips else 1) * (count[STICK] + count[SLIP] // 2)  # as a change costs a factor
-        self._unknowns(slips=len(self.inverse.made) > 0 and count[OPEN] <= rather)
+        self._matrices()
 
-    def _unknowns(self, slips: bool) -> None:
-        """Let slips be the unknowns, or forces, and the struct have the matrix of their equations."""
-        f, inverse = self.f, self.inverse
-        f.slips, null = slips, self.code[0].NULL
-        if slips:
-            self._point(inverse=inverse.made)
-        if f.single:
-            self._point(**{"inverse_low" if slips else "low": inverse.single(slips)})
-        else:
-            f.low = f.inverse_low = null
-            self.arrays.pop("low", None), self.arrays.pop("inverse_low", None)
+    def _matrices(self) -> None:
+        """Let the struct have W^-1 and both matrices in single precision, where they are."""
+        made = self.inverse.made
+        low = (self.inverse.single(False), self.inverse.single(True)) if self.f.single else (NONE, NONE)
+        for name, array in (("inverse", made), ("low", low[0]), ("inverse_low", low[1])):
+            if len(array):
+                self._point(**{name: array})
+            elif array is not self.arrays.get(name):
+                setattr(self.f, name, self.code[0].NULL)
+                self.arrays[name] = array
 
-    def _rounds(self, led: bool = False, known: bool = False) -> int:
-        """How Newton's method from the present sets ends."""
+    def _refuse(self) -> None:
+        """Do without W^-1."""
+        self.inverse.refuse()
+        self._matrices()
+
+    def _rounds(self, where: int = HERE, known: bool = False) -> int:
+        """How Newton's method from the present forces and sets ends."""
         code, f, begin = self.code[1], self.f, 0
-        code.softgrasp_begin(f, led, known)
-        while (end := code.softgrasp_rub(f, begin, ROUNDS[self.m], led)) == WANTED:
+        code.softgrasp_begin(f, where, known)
+        while (end := code.softgrasp_rub(f, begin, ROUNDS[self.m])) == WANTED:
             self._factor()
             begin = int(self.tally[2])
         return int(end)
@@ -271,19 +262,18 @@ class Coulomb(Rounds):
 
     def state(self) -> Array:
         """Numbers from which a run continues with the same bits."""
-        factor = (0, 0, 0, 0, 0) if self.f is None else tuple(getattr(self.f, name) for name in FACTOR)
+        known = [0 if self.f is None else getattr(self.f, name) for name in KNOWN]
         inverse = self.inverse.spent, len(self.inverse.made)
-        head = np.array([len(self.kind), *factor, *inverse, *self.tally[:2], self.had], dtype=float)
+        head = np.array([len(self.kind), *inverse, *self.tally[:2], *known], dtype=float)
         parts = self.x, self.y, self.kind, self.e, self.kind0, self.e0, self.before, self.before_y
         return np.concatenate([head, *(np.asarray(part, dtype=float).ravel() for part in parts)])
 
     def resume(self, numbers: Array, W: Array, mu: Array) -> None:
         """Continue with what `state` returned, and the W and mu of the last call."""
-        head, numbers = np.split(numbers, [11])
-        k, rows, slips, single, age = (int(n) for n in head[:5])
-        s = 1 + self.m
+        head, numbers = np.split(numbers, [5 + len(KNOWN)])
+        k, s, spent, (rows, slips0, single, age, work, slips, had) = int(head[0]), 1 + self.m, head[1], head[5:]
         self.fit(k)
-        self.tally[:2], self.had = head[8:10], bool(head[10])
+        self.tally[:2] = head[3:5]
         arrays: tuple[NDArray[Any], ...]
         arrays = self.x, self.y, self.kind, self.e, self.kind0, self.e0, self.before, self.before_y
         parts = np.split(numbers, np.cumsum([array.size for array in arrays]))
@@ -293,15 +283,15 @@ class Coulomb(Rounds):
             return
         self._use(bool(single))
         self.inverse.of(W, k * s)
-        self.inverse.spent = head[6]
-        if head[7]:
+        self.inverse.spent = spent
+        if head[2]:
             self.inverse.make()
+        self._point(W=W, mu=mu)
+        self.f.ld, self.f.slips, self.f.had = W.shape[1], int(slips), int(had)
+        self._matrices()
         if rows:
-            self._point(W=W, mu=mu)
-            self.f.ld = W.shape[1]
-            self._unknowns(bool(slips))
             kind, e = self.kind.copy(), self.e.copy()
-            self.kind[:], self.e[:] = self.kind0, self.e0
+            self.kind[:], self.e[:], self.f.slips = self.kind0, self.e0, int(slips0)
             self._factor()
-            self.kind[:], self.e[:] = kind, e
-            self.inverse.spent, self.f.age, self.f.work = head[6], age, head[5]
+            self.kind[:], self.e[:], self.f.slips = kind, e, int(slips)
+            self.inverse.spent, self.f.age, self.f.work = spent, int(age), work

@@ -68,20 +68,37 @@ static void adapt(const Rub *f, int all) {
   for (int r = 0; r < K; r++) f->x[r] = (all ? 0 : f->x[r]) + v[r];
 }
 
-/* Where rounds begin: with `lead` from forces or slips that continue those of the last two steps; those of the last step
-   into `before`. `known`: whether y is W x + q. */
-void softgrasp_begin(Rub *f, int lead, int known) {
+/* Whether slips are the unknowns, as W^-1 is there and few enough nodes are open; a change costs a factor. */
+static int choose(const Rub *f) {
+  int open = 0, pressed = 0;
+  for (int i = 0; i < f->k; i++) {
+    open += 2 * (f->kind[i] == OPEN);
+    pressed += f->kind[i] == STICK ? 2 : f->kind[i] == SLIP;
+  }
+  return f->inverse && open <= (f->slips ? 2 : 1) * pressed;
+}
+
+/* Where rounds begin. HERE: as x and sets are; OPENED: nodes that would meet without forces stick; FIRST: besides, from
+   forces or slips that continue those of the last two steps, if these had any. `known`: whether y is W x + q. */
+void softgrasp_begin(Rub *f, int where, int known) {
   const int s = 1 + f->m, K = f->k * s;
+  const int had = f->had;
   f->begun = 0;
-  for (int r = 0; lead && r < K; r++) {
+  if (where == FIRST) f->had = 0;
+  for (int r = 0; where == FIRST && r < K; r++) f->had |= f->x[r] != 0;
+  f->led = where == FIRST && had && f->had;
+  for (int i = 0; where != HERE && !f->led && i < f->k; i++)
+    if (f->kind[i] == OPEN && f->q[i * s] < 0) f->kind[i] = STICK;
+  f->slips = choose(f);
+  for (int r = 0; where == FIRST && r < K; r++) {
     const double x = f->x[r], y = f->y[r];
-    if (f->slips) f->y[r] = 2 * y - f->before_y[r];
-    else f->x[r] = f->kind[r / s] == OPEN ? 0 : 2 * x - f->before[r];
+    if (f->led && f->slips) f->y[r] = 2 * y - f->before_y[r];
+    else if (f->led) f->x[r] = f->kind[r / s] == OPEN ? 0 : 2 * x - f->before[r];
     f->before[r] = x, f->before_y[r] = y;
   }
-  if (!known && !(lead && f->slips)) evaluate(f);
-  if (f->slips) adapt(f, lead);
-  if (lead) classify(f);
+  if (!known && !(f->led && f->slips)) evaluate(f);
+  if (f->slips) adapt(f, f->led);
+  if (f->led) classify(f);
 }
 
 /* Residual of the equations of the present sets into b; the largest. */
@@ -230,13 +247,13 @@ static void end_round(Rub *f) {
 }
 
 /* Rounds from round `begin` on. WANTED: call softgrasp_matrix, factor LU, and call again with the round in tally[2]. */
-int softgrasp_rub(Rub *f, int begin, int rounds, int led) {
+int softgrasp_rub(Rub *f, int begin, int rounds) {
   double *b = f->room;
   for (int round = begin, drifts = 0;; round++) {
     if (!f->begun) {
       double left = residual(f, b);
       int changed = 0;
-      if (round || led || left <= f->tol) changed = classify(f), left = residual(f, b);
+      if (round || f->led || left <= f->tol) changed = classify(f), left = residual(f, b);
       if (!changed && left <= f->tol) {
         if (!f->slips) return SOLVED;
         settle(f);

@@ -63,7 +63,7 @@ class Inverse:
     def single(self, inverse: bool) -> Array:
         """W or its inverse in single precision, (k, k)."""
         if inverse:
-            if not len(self.made_low):
+            if len(self.made) and not len(self.made_low):
                 self.made_low = self.made.astype(np.float32)
             return self.made_low
         if not len(self.low):

@@ -26,6 +26,7 @@
 #include "triangle.h"
 
 enum { OPEN, STICK, SLIP };
+enum { HERE, OPENED, FIRST };
 enum { SOLVED = 0, WANTED = 1, CYCLED = 2, DRIFTED = 3 }; /* the last: W^-1 is too inexact */
 enum { KEPT = 24, DRIFTS = 3, PATIENCE = 12 }; /* steps of a round, refinements of W^-1, rounds without gain, at most */
 static const double RIDGE_SINGLE = 1e-7; /* as RIDGE, of a factor in single precision */
@@ -40,6 +41,7 @@ typedef struct {
   double tol;                /* of gaps and slips */
   double *before, *before_y; /* x and y at the end of the step before the last (K) */
   double *x, *y;             /* forces, and W x + q (K) */
+  int had, led;              /* whether that step had forces, and this solve continues them */
   int *kind;                 /* sets (k) */
   double *e;                 /* of a slipping node: direction of its force, and mu x_n over |x_t - y_t / W_tt| (k (m + 1)) */
   int slips;                 /* whether the unknowns are y */
