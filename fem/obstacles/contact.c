@@ -33,15 +33,6 @@ double softgrasp_look(const Flat *f) {
   return most;
 }
 
-/* z = D x for a column x, or for y. Products of column j with those up to it. */
-void softgrasp_products(const Swept *s, int j, double *to) {
-  for (int i = 0; i < s->reached; i++)
-    for (int a = 0; a < s->d; a++) s->z[s->nodes[i] * s->d + a] = 0;
-  softgrasp_add(s, j, 1, s->z);
-  softgrasp_scale(s, s->z);
-  for (int k = 0; k <= j; k++) to[k] = softgrasp_times(s, k);
-}
-
 /* Half the gap of a row at the end of the step, or half its slip in the step. */
 static double value(const Flat *f, int j) {
   const int *row = f->row + 4 * j;

@@ -15,6 +15,7 @@ typedef struct {
   double *y, *z;        /* first sweep, and room that is zero elsewhere (n) */
 } Swept;
 
+/* z = D x. */
 static void softgrasp_scale(const Swept *s, const double *from) {
   const int d = s->d;
   const double *D = s->D;
@@ -27,6 +28,7 @@ static void softgrasp_scale(const Swept *s, const double *from) {
   }
 }
 
+/* Column k times z. */
 static double softgrasp_times(const Swept *s, int k) {
   const double *v = s->values + s->at[k];
   double sum = 0;
@@ -37,6 +39,7 @@ static double softgrasp_times(const Swept *s, int k) {
   return sum;
 }
 
+/* Add t times column k. */
 static void softgrasp_add(const Swept *s, int k, double t, double *to) {
   const double *v = s->values + s->at[k];
   for (int i = s->first[k]; i < s->first[k + 1]; i++) {
@@ -44,4 +47,13 @@ static void softgrasp_add(const Swept *s, int k, double t, double *to) {
     for (int j = 0; j < s->runs[2 * i + 1]; j++) y[j] += t * v[j];
     v += s->runs[2 * i + 1];
   }
+}
+
+/* Products of column j with those up to it. */
+void softgrasp_products(const Swept *s, int j, double *to) {
+  for (int i = 0; i < s->reached; i++)
+    for (int a = 0; a < s->d; a++) s->z[s->nodes[i] * s->d + a] = 0;
+  softgrasp_add(s, j, 1, s->z);
+  softgrasp_scale(s, s->z);
+  for (int k = 0; k <= j; k++) to[k] = softgrasp_times(s, k);
 }
