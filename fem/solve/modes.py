@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from mpi4py import MPI
 from slepc4py import SLEPc
@@ -16,6 +18,7 @@ PREFIX = "softgrasp_modes_"
 TOLERANCE = 1e-11  # of 1/omega^2 in the iteration; rounding in M-products is about 1e-15 n^(1/2)
 RESIDUAL = 1e-8  # largest bound on the relative error of omega^2 that is accepted
 KEPT_ENTRIES = 50_000_000  # of modes that stay with the system: 400 MB over all ranks
+SPARE = 4  # further columns of a block, which converge last [1]
 ROUGH = 1e-3  # tolerance of the search for missed copies [1]: enough where others lie ten times as far away
 
 
@@ -23,8 +26,9 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
     """Solve K_ee phi = omega^2 M_ee phi for the k smallest omega, with Phi' M_ee Phi = I.
 
     Krylov-Schur on K_ee^-1 M_ee (shift-and-invert at 0, one Cholesky factor). A second run in the M-orthogonal
-    complement catches copies of multiple eigenvalues that one Krylov space cannot see. The sign of a mode does not
-    depend on the rank count. Modes stay with the system: a later call for fewer returns the first of them. Collective.
+    complement catches copies of multiple eigenvalues that one Krylov space cannot see. Where no factor fits, LOBPCG
+    [K01] for all k at once, with a V-cycle of the iterative solver. The sign of a mode does not depend on the rank
+    count. Modes stay with the system: a later call for fewer returns the first of them. Collective.
 
     ``k``: number of modes, 1 <= k <= n_e.
 
@@ -40,7 +44,7 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
     kept = system.kept.get("modes")
     if kept is None or kept[0] != key or len(kept[1]) < k:
         name = choose_solver(system.layout, few=True)[0]  # as for static solves, whose factor is this one
-        with factored_stiffness(system, "mumps" if name in ITERATIVE else name) as solver:
+        with factored_stiffness(system, name) as solver:
             kept = key, *_lowest(system, solver, k), system.K_ee, system.M_ee  # no other can get their handles
         if system.M_ee.getType() != PETSc.Mat.Type.PYTHON and k * n_e <= KEPT_ENTRIES:
             system.kept["modes"] = kept
@@ -49,13 +53,16 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
 
 def _lowest(system: BlockSystem, solver: TissueSolver, k: int) -> tuple[Array, Array]:
     """Compute omega [1/s], (k,), and Phi, local rows (n_local, k). Collective."""
-    n_e = system.layout.n_e
-    eps = _make_eps(system, solver)
+    n_e, iterated = system.layout.n_e, solver.name in ITERATIVE
+    eps = _make_block_eps(system, solver, k) if iterated else _make_eps(system, solver)
     vectors: list[PETSc.Vec] = []
     squares: list[float] = []
     try:
-        _solve(eps, system, k, vectors, squares)
-        while len(vectors) < n_e:
+        if iterated:
+            _collect(eps, system, k, vectors, squares)
+        else:
+            _solve(eps, system, k, vectors, squares)
+        while len(vectors) < n_e and not iterated:  # a block sees all copies
             last = sorted(squares)[k - 1]
             _solve(eps, system, 1, vectors, squares, ROUGH)
             if squares[-1] >= last * (1 + 10 * ROUGH):
@@ -66,7 +73,7 @@ def _lowest(system: BlockSystem, solver: TissueSolver, k: int) -> tuple[Array, A
             if squares[-1] >= last * (1 - RESIDUAL):
                 break
         order = np.argsort(squares)[:k]
-        return _finish(eps, system, [vectors[i] for i in order])
+        return _finish(solver, system, [vectors[i] for i in order])
     finally:
         eps.destroy()
         for vector in vectors:
@@ -82,35 +89,62 @@ def _generic(system: BlockSystem, number: int) -> Array:
     return np.column_stack([np.cos(phase * (1 + 0.3 * c) + 1 + c) for c in range(d)]).ravel()
 
 
-class _Factored:
-    """The preconditioner of an exact solve, for SLEPc."""
+class _Preconditioner:
+    """A solve, or one V-cycle, as the preconditioner of SLEPc."""
 
-    def __init__(self, solver: TissueSolver) -> None:
-        self.solver = solver
+    def __init__(self, solve: Callable[[PETSc.Vec, PETSc.Vec], None]) -> None:
+        self.solve = solve
 
     def apply(self, pc: PETSc.PC, r: PETSc.Vec, w: PETSc.Vec) -> None:
-        """Set w = K_ee^-1 r. Collective."""
-        self.solver.solve(r, w)
+        """Set w = K_ee^-1 r, or about that. Collective."""
+        self.solve(r, w)
 
 
 def _make_eps(system: BlockSystem, solver: TissueSolver) -> SLEPc.EPS:
     """Krylov-Schur on K_ee^-1 M_ee, with the factor of ``solver``. Collective."""
+    eps = _eps(system, solver.solve, SLEPc.EPS.Type.KRYLOVSCHUR, SLEPc.ST.Type.SINVERT)
+    eps.setWhichEigenpairs(SLEPc.EPS.Which.TARGET_MAGNITUDE)
+    eps.setTarget(0.0)
+    eps.setPurify(False)  # for singular M_ee; needs one solve a mode
+    from_options(eps)
+    return eps
+
+
+def _make_block_eps(system: BlockSystem, solver: TissueSolver, k: int) -> SLEPc.EPS:
+    """LOBPCG for k modes at once with the V-cycle of ``solver``, from generic columns. Collective."""
+    eps, size = _eps(system, solver.ksp.getPC().apply, SLEPc.EPS.Type.LOBPCG, SLEPc.ST.Type.PRECOND), k + SPARE
+    eps.setWhichEigenpairs(SLEPc.EPS.Which.SMALLEST_REAL)
+    eps.setLOBPCGBlockSize(size)
+    eps.setDimensions(nev=k, ncv=3 * size)
+    starts = [system.K_ee.createVecRight() for _ in range(size)]
+    for i, start in enumerate(starts):
+        start.array_w[:] = _generic(system, i)
+    eps.setInitialSpace(starts)
+    product = starts[0].duplicate()
+    system.M_ee.mult(starts[0], product)
+    # SLEPc compares |K phi - omega^2 M phi| with omega^2 for phi'M phi = 1, where |M phi| is about this root [kg^(1/2)]
+    root = product.norm() / np.sqrt(product.dot(starts[0]))
+    eps.setTolerances(RESIDUAL / 10 * root, 500)
+    for vector in (*starts, product):
+        vector.destroy()
+    from_options(eps)
+    return eps
+
+
+def _eps(system: BlockSystem, solve: Callable[[PETSc.Vec, PETSc.Vec], None], kind: str, transform: str) -> SLEPc.EPS:
+    """An eigensolver of a type with a spectral transformation that solves by ``solve``. Collective."""
     eps = SLEPc.EPS().create(system.layout.comm)
     eps.setOptionsPrefix(PREFIX)
     eps.setOperators(system.K_ee, system.M_ee)
     eps.setProblemType(SLEPc.EPS.ProblemType.GHEP)
-    eps.setType(SLEPc.EPS.Type.KRYLOVSCHUR)
-    eps.setWhichEigenpairs(SLEPc.EPS.Which.TARGET_MAGNITUDE)
-    eps.setTarget(0.0)
-    eps.setPurify(False)  # for singular M_ee; needs one solve a mode
+    eps.setType(kind)
     st = eps.getST()
-    st.setType(SLEPc.ST.Type.SINVERT)
+    st.setType(transform)
     ksp = st.getKSP()
     ksp.setType("preonly")
     pc = ksp.getPC()
     pc.setType("python")
-    pc.setPythonContext(_Factored(solver))
-    from_options(eps)
+    pc.setPythonContext(_Preconditioner(solve))
     return eps
 
 
@@ -130,6 +164,12 @@ def _solve(
     start = system.K_ee.createVecRight()
     start.array_w[:] = _generic(system, len(vectors))
     eps.setInitialSpace(start)
+    start.destroy()
+    _collect(eps, system, k, vectors, squares)
+
+
+def _collect(eps: SLEPc.EPS, system: BlockSystem, k: int, vectors: list[PETSc.Vec], squares: list[float]) -> None:
+    """Iterate, and append k modes. Collective."""
     try:
         eps.solve()
     except (PETSc.Error, SystemError) as error:
@@ -137,8 +177,6 @@ def _solve(
             f"modes: the iteration with the {system.layout.n_e} x {system.layout.n_e} stiffness failed ({error}); "
             "check material, mesh and contact zone"
         ) from error
-    finally:
-        start.destroy()
     if eps.getConverged() < k:
         raise SolverError(
             f"modes: {eps.getConverged()} of {k} converged in {eps.getIterationNumber()} iterations "
@@ -150,9 +188,11 @@ def _solve(
         vectors.append(vector)
 
 
-def _finish(eps: SLEPc.EPS, system: BlockSystem, modes: list[PETSc.Vec]) -> tuple[Array, Array]:
+def _finish(solver: TissueSolver, system: BlockSystem, modes: list[PETSc.Vec]) -> tuple[Array, Array]:
     """Normalise, fix the signs and check the residuals |K phi - omega^2 M phi|_(K^-1) / omega. Collective."""
-    comm, ksp = system.layout.comm, eps.getST().getKSP()
+    comm, rtol = system.layout.comm, solver.ksp.getTolerances()[0]
+    if solver.name in ITERATIVE:  # a number to one digit
+        solver.ksp.setTolerances(rtol=0.1)
     omega, Phi = np.empty(len(modes)), np.empty((system.layout.n_local, len(modes)), order="F")
     y, r = system.K_ee.createVecs()
     compass = _generic(system, 0)
@@ -164,7 +204,7 @@ def _finish(eps: SLEPc.EPS, system: BlockSystem, modes: list[PETSc.Vec]) -> tupl
         system.K_ee.mult(phi, r)
         square = float(phi.dot(r))
         r.axpy(-square, y)
-        ksp.solve(r, y)
+        solver.solve(r, y)
         error = np.sqrt(abs(r.dot(y)) / square) if square > 0 else np.inf
         if not error <= RESIDUAL:
             raise SolverError(
@@ -173,6 +213,7 @@ def _finish(eps: SLEPc.EPS, system: BlockSystem, modes: list[PETSc.Vec]) -> tupl
             )
         omega[i] = np.sqrt(square)
         Phi[:, i] = phi.array_r
+    solver.ksp.setTolerances(rtol=rtol)
     y.destroy()
     r.destroy()
     return omega, Phi

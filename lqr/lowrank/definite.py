@@ -58,7 +58,7 @@ class DefiniteTissue(ShiftedTissue):
         fitting = replace(work, few=False).choose(layout.comm.bcast(free_memory()))
         name = min(fitting, key=work.seconds)
         self.solver = make_solver(dynamic_stiffness(self.system, -p.real), name, layout, PREFIX, RESPONSE_RTOL)
-        self.shift = p
+        self.shift, self.package = p, self.solver.package
         self.factors += 1
 
     def _solve_each(self, shifts: Sequence[complex], rights: Sequence[Array | Complex]) -> list[Complex]:

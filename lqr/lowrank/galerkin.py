@@ -227,7 +227,7 @@ class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
             )
         settled = f"{order} basis vectors, gain settled to {history[-1]['change']:.1e}"
         about = f"all {order} basis vectors that there are" if order == whole else settled
-        about += f", {tissue.name} tissue solves"
+        about += f", {tissue.about}"
         counts = {"solves": used, "basis": order, "spaces": len(history) + 1}
         return Iterate(level.Z, level.gain, about, history, counts)
 

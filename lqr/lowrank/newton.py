@@ -190,7 +190,7 @@ class NewtonADI(LowRankSolver[ModalStart]):
             sweep = None
         counts = {"newton_steps": state.step, "adi_steps": state.solves, "solves": state.solves}
         counts["columns"] = sweep.Z.appended
-        about = f"low rank, {counted(state.step, 'Newton step')}, {tissue.name} tissue solves"
+        about = f"low rank, {counted(state.step, 'Newton step')}, {tissue.about}"
         return Iterate(sweep.Z.block, sweep.new.block, about, state.history, counts, state.seconds)
 
     def _sweep(

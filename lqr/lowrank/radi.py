@@ -101,7 +101,7 @@ class RADI(LowRankSolver[ModalStart]):
             self.record(history, entry)
             if relative <= STOP * self.tol:
                 counts = {"adi_steps": sweep.steps, "solves": sweep.steps, "columns": sweep.Z.appended}
-                about = f"low rank from X = 0, {tissue.name} tissue solves"
+                about = f"low rank from X = 0, {tissue.about}"
                 return Iterate(sweep.Z.block, sweep.gain.block, about, history, counts, sweep.seconds)
         raise SolverError(
             f"radi: relative residual {relative:.1e} after {sweep.steps} solves, tolerance {self.tol:.0e}; add "

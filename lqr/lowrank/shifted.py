@@ -19,6 +19,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, Complex, PETSc, from_options, petsc_options, whole_copy
 from softgrasp.fem.resources import free_memory
 from softgrasp.fem.solve.cholesky import direct_solves
+from softgrasp.fem.solve.solvers import package_of
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.lowrank.ahead import FactorsAhead
 from softgrasp.lqr.plant.checks import MODAL_KEY
@@ -42,6 +43,7 @@ class ShiftedTissue(ABC):
     """Solves S(p) B = F for distributed F."""
 
     name: str  # gathered or distributed
+    package: str = ""  # that made the last factor; where it is PETSc's, as PETSc reports it
 
     def __init__(self, system: BlockSystem) -> None:
         layout, self.damping = system.layout, system.damping
@@ -79,6 +81,11 @@ class ShiftedTissue(ABC):
         """How many of the first shifts are solved with at the same time."""
         return 1
 
+    @property
+    def about(self) -> str:
+        """Kind of solves and who factored, in words."""
+        return f"{self.name} tissue solves" + (f" by {self.package}" if self.package else "")
+
     @abstractmethod
     def _factor(self, shifts: list[complex]) -> None:
         """Have the factor of the first shift, made now or before. Collective."""
@@ -104,7 +111,7 @@ class GatheredTissue(ShiftedTissue):
     program of one rank that may use another core makes the next factors there while it works with the present one.
     """
 
-    name = "gathered"
+    name, package = "gathered", "SuperLU"  # of SciPy
 
     def __init__(self, system: BlockSystem) -> None:
         super().__init__(system)
@@ -299,7 +306,7 @@ class DistributedTissue(ShiftedTissue):
             raise SolverError(f"MUMPS failed at the shift p = {p:.4g} (PETSc error {error.ierr})") from error
         if self.ksp.getPC().getFailedReason():
             raise SolverError(f"MUMPS failed at the shift p = {p:.4g}: S(p) is singular or memory ran out")
-        self.shift = p
+        self.shift, self.package = p, package_of(self.ksp.getPC())
         self.factors += 1
 
     def _solve_each(self, shifts: Sequence[complex], rights: Sequence[Array | Complex]) -> list[Complex]:

@@ -222,7 +222,7 @@ def _explained(scene: Scene, looked: Model, sizes: ModelSizes, model: Model | No
     name, reason = chosen(scene, work, free)
     copies = work.copies(name)
     small = looked.system
-    if small.layout.n_e <= DIRECT_LIMIT[d]:  # the modes need a factor
+    if small.layout.n_e <= DIRECT_LIMIT[d]:  # beyond, modes take minutes
         omega, Phi = lowest_modes(small, min(MODES, small.layout.n_e))
     else:
         omega, Phi = np.zeros(0), np.zeros((small.layout.n_local, 0))

@@ -116,6 +116,7 @@ def test_same_result_on_every_rank_count() -> None:
     reference = gain(alone, NewtonADI().solve(alone))
     for method in (NewtonADI(), NewtonADI(tissue="distributed"), RADI(), RADI(tissue="distributed")):
         found = method.solve(problem)
+        assert found.about.endswith("by MUMPS" if method.tissue == "distributed" else "by SuperLU")
         error = np.linalg.norm(gain(problem, found) - reference) / np.linalg.norm(reference)
         assert error < 1e-9  # both stop at a residual of 1e-10
         assert len(set(problem.layout.comm.allgather(found.gain.K_s.tobytes()))) == 1
