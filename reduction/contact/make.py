@@ -1,6 +1,7 @@
-"""Making of reduced models with contact: V = [K^-1 G, modes, K^-1 N'], orthonormal in the mass [CB68].
+"""Making of reduced models with contact: V = [K^-1 G, modes, K^-1 N', S^-1 N'm], orthonormal in the mass [CB68].
 
-On fine meshes rows of hat functions h_j over several nodes replace those of nodes: mean gaps are >= 0.
+On fine meshes rows of hat functions h_j over several nodes replace those of nodes: mean gaps are >= 0. The last column,
+S = K + s D + s^2 M at a frequency above the modes, is the answer to the impulse m that stops a face that lands at once.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ from softgrasp.fem.run.contact.expected import nearest_gaps
 from softgrasp.fem.run.midpoint import viscosity
 from softgrasp.fem.run.motion import motion_table
 from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from softgrasp.fem.solve.stiffness import static_columns
+from softgrasp.fem.system import BlockSystem, dynamic_stiffness
 from softgrasp.reduction.contact.model import ContactModel, Ints, plane
 from softgrasp.reduction.origin import origin_of
 from softgrasp.reduction.system import ModelError
@@ -26,16 +29,19 @@ from softgrasp.reduction.system import ModelError
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
 
+PREFIX = "softgrasp_landing_"
 DEPENDENT = 1e-13  # least share of a direction of the basis in its Gram matrix, scaled [1]
-CROWD = 1.5  # power of the distance from the end by which hat functions crowd there, where pressures are steep [1]
+LANDING = 8.0  # s of the answer to a landing over the frequency of the highest mode; 2 to 32 do as well [1]
+CROWD = 1.6  # power of the distance from the end by which hat functions crowd there, where pressures are steep [1]
 
 
 def contact_model(model: Model, modes: int = 10, reach: float | None = None, rows: int | None = None) -> ContactModel:
-    """The tissue in coordinates z = V a, V = [K^-1 G, modes, K^-1 N'] orthonormal in the mass [CB68]. Collective.
+    """The tissue in coordinates z = V a, V = [K^-1 G, modes, K^-1 N', S^-1 N'm] orthonormal in M [CB68]. Collective.
 
     Args:
         model: with ``effects.obstacles`` and a hand that does not feel the tissue.
-        modes: number of clamped modes beside the responses.
+        modes: number of columns beside the responses to the hand and to the rows, at least 2: clamped modes, and one
+            answer to a landing for each direction of the half-spaces.
         reach: rows N are kept for boundary nodes that come nearer than this to an obstacle while the undeformed body
             follows the hand of the scene [m]; None: half the distance of boundary nodes. A run in which another node
             enters an obstacle is refused.
@@ -67,7 +73,10 @@ def contact_model(model: Model, modes: int = 10, reach: float | None = None, row
         kept = _foremost(surface.X, kept, obstacles, near)
     hats = tuple(_hats(surface, kept, o, rows) for o in obstacles)
     loads = _responses(model, surface, kept, obstacles, hats)
-    blocks = [static_columns(system, np.asfortranarray(np.hstack([system.G, loads]))), lowest_modes(system, modes)[1]]
+    normals = np.unique([plane(o)[0] for o in obstacles], axis=0)
+    squares, shapes = lowest_modes(system, max(1, modes - len(normals)))
+    blocks = [static_columns(system, np.asfortranarray(np.hstack([system.G, loads]))), shapes]
+    blocks.append(_landing(system, surface, kept, normals, LANDING * float(np.sqrt(squares[-1]))))
     V, stiffness = _diagonal(model, np.hstack(blocks))
     seconds["basis"] = time.perf_counter() - begin
     begin = time.perf_counter()
@@ -158,6 +167,21 @@ def _responses(
     result = np.zeros((model.system.layout.n_local, whole.shape[1]), order="F")
     result[surface.rows] = whole[surface.mine]
     return result
+
+
+def _landing(system: BlockSystem, surface: Surface, kept: Ints, normals: Array, s: float) -> Array:
+    """(K + s D + s^2 M)^-1 of the momentum of the kept nodes as the body moves along each normal. Collective."""
+    layout, d = system.layout, surface.X.shape[1]
+    moved = times_columns(system.M_ee, np.asfortranarray(np.tile(normals.T, (layout.n_local // d, 1))))
+    there, loads = np.zeros(len(surface.dofs), dtype=bool), np.zeros_like(moved, order="F")
+    there[(kept[:, None] * d + np.arange(d)).ravel()] = True
+    rows = surface.rows[there[surface.mine]]
+    loads[rows] = moved[rows]
+    solver = make_solver(dynamic_stiffness(system, s), choose_solver(layout, few=True)[0], layout, PREFIX, rtol=1e-12)
+    try:
+        return solver.columns(loads, "the answer to a landing")
+    finally:
+        solver.destroy()
 
 
 def _diagonal(model: Model, X: Array) -> tuple[Array, Array]:

@@ -1,7 +1,8 @@
-"""Reduced models with contact: z = V a, V = [K^-1 G, modes, K^-1 N'], orthonormal in the mass [CB68].
+"""Reduced models with contact: z = V a, V = [K^-1 G, modes, K^-1 N', S^-1 N'm], orthonormal in the mass [CB68].
 
 Modes alone miss what a force on a node does next to it: nodal forces come out wrong by their own size. With the static
-response of every node that may touch beside them, the answer to slow forces there is exact. On fine meshes rows of hat
+response of every node that may touch beside them, the answer to slow forces there is exact; the last column, see
+`make.py`, answers the impulse of a face that lands at once. On fine meshes rows of hat
 functions h_j over several nodes replace those of nodes, N_j = sum_i h_j(x_i) N_i / sum_i h_j(x_i): mean gaps are >= 0.
 """
 

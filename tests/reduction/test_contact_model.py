@@ -22,6 +22,7 @@ SCENE = ["effects.obstacles=true", "effects.gravity={g=[0, -1]}", "effects.dampi
          "output.snapshots='memory'", "time.start='equilibrium'"]  # fmt: skip
 MADE = "motion={target=[0.5, -0.12], duration=2.0}"
 OTHER = "motion={target=[-0.8, -0.15], duration=2.0}"  # the other way, faster and deeper
+STRAIGHT = "motion={target=[0.0, -0.12], duration=2.0}"  # the whole face lands at once
 SHORT = ["tissue.cells=[5, 10]", "time={steps=300, end=3.0, start='equilibrium'}"]
 LONG = ["time={steps=600, end=3.0, start='equilibrium'}"]
 
@@ -46,8 +47,8 @@ def test_thirty_columns_repeat_a_motion_they_were_not_made_for() -> None:
     assert rom.N <= 30
     assert full.contact is not None
     assert (full.contact.touching > 0).mean() > 0.2
-    assert z < 1e-3  # asked for; measured 9.2e-4
-    assert force < 1e-2  # asked for; measured 4.2e-3
+    assert z < 1e-3  # asked for; measured 8.4e-4
+    assert force < 1e-2  # asked for; measured 3.9e-3
     assert run.gap.min() > -1e-14  # of a body of 2 m
     # as far as z from the full run, relative to the deformation
     assert np.abs(run.outputs - full.outputs).max() < 2e-3 * np.abs(full.outputs - full.outputs_rigid).max()
@@ -55,10 +56,11 @@ def test_thirty_columns_repeat_a_motion_they_were_not_made_for() -> None:
 
 @pytest.mark.slow
 @pytest.mark.serial
-def test_hats_over_nodes_keep_the_dimension_on_a_fine_mesh() -> None:
+@pytest.mark.parametrize("motion", [OTHER, STRAIGHT])
+def test_hats_over_nodes_keep_the_dimension_on_a_fine_mesh(motion: str) -> None:
     fine = "tissue.cells=[60, 120]"
     rom = contact_model(landing(MADE, *LONG, fine), 14, rows=14)
-    model = landing(OTHER, *LONG, fine)
+    model = landing(motion, *LONG, fine)
     begin = time.process_time()
     full = simulate(model)
     spent = time.process_time() - begin
@@ -68,8 +70,8 @@ def test_hats_over_nodes_keep_the_dimension_on_a_fine_mesh() -> None:
     z, force = errors(full, run, rom.V, MPI.COMM_SELF)
     assert rom.N <= 30
     assert len(rom.kept) == 61  # those of the face, without the sides
-    assert z < 1e-3  # asked for; measured 6.6e-4
-    assert force < 1e-2  # asked for; measured 3.8e-3
+    assert z < 1e-3  # asked for; measured 7.1e-4 and 4.8e-4
+    assert force < 1e-2  # asked for; measured 2.5e-3 and 5.9e-3, 1.4e-2 with a mode for the answer to a landing
     assert spent > 10  # asked for; of the whole run, whose setup is a small part
     # between hat functions nodes sink in, by a part of the deformation of 0.1 m
     assert -1e-3 < run.gap.min() < 0
