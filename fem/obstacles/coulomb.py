@@ -79,12 +79,12 @@ class Coulomb(Rounds):
         if self.code is None:
             return
         K = k * s
-        self.pivot = np.zeros(K, np.intc)
+        self.pivot, self.q, self.mu = np.zeros(K, np.intc), np.zeros(K), np.zeros(k)
         self._use(self.m > 1 and k >= SINGLE)
         self._point(
             before=self.before, before_y=self.before_y, x=x, y=y, kind=kind, e=e, pivot=self.pivot, kind0=self.kind0,
-            e0=self.e0, solved=np.zeros(K), lacks=np.zeros(K), Z=np.zeros((KEPT, K)), C=np.zeros((KEPT, K)),
-            room=np.zeros(8 * K), seen=np.zeros((ROUNDS[self.m], k), np.int8), tally=self.tally,
+            q=self.q, mu=self.mu, e0=self.e0, solved=np.zeros(K), lacks=np.zeros(K), Z=np.zeros((KEPT, K)),
+            C=np.zeros((KEPT, K)), room=np.zeros(8 * K), seen=np.zeros((ROUNDS[self.m], k), np.int8), tally=self.tally,
         )  # fmt: skip
         self.f.k, self.f.m, self.f.rows, self.f.slips, self.f.had = k, self.m, 0, 0, 0
 
@@ -215,11 +215,13 @@ class Coulomb(Rounds):
 
     def _describe(self, W: Array, q: Array, mu: Array, tol: float) -> None:
         """Let the struct have the problem."""
-        if W is not self.arrays.get("W"):
-            self.f.rows = 0
         self.inverse.of(W, len(q))
-        self._point(W=W, q=q, mu=mu)
-        self.f.ld, self.f.tol = W.shape[1], tol
+        self.q[:], self.mu[:], self.f.tol = q, mu, tol
+        if W is not self.arrays.get("W"):
+            self._point(W=W)
+            self.f.rows, self.f.ld = 0, W.shape[1]
+        elif self.inverse.made is self.arrays.get("inverse"):
+            return
         self._matrices()
 
     def _matrices(self) -> None:
@@ -263,17 +265,17 @@ class Coulomb(Rounds):
     def state(self) -> Array:
         """Numbers from which a run continues with the same bits."""
         known = [0 if self.f is None else getattr(self.f, name) for name in KNOWN]
-        inverse = self.inverse.spent, len(self.inverse.made)
+        inverse = self.inverse.k, self.inverse.spent, len(self.inverse.made)
         head = np.array([len(self.kind), *inverse, *self.tally[:2], *known], dtype=float)
         parts = self.x, self.y, self.kind, self.e, self.kind0, self.e0, self.before, self.before_y
         return np.concatenate([head, *(np.asarray(part, dtype=float).ravel() for part in parts)])
 
     def resume(self, numbers: Array, W: Array, mu: Array) -> None:
         """Continue with what `state` returned, and the W and mu of the last call."""
-        head, numbers = np.split(numbers, [5 + len(KNOWN)])
-        k, s, spent, (rows, slips0, single, age, work, slips, had) = int(head[0]), 1 + self.m, head[1], head[5:]
+        head, numbers = np.split(numbers, [6 + len(KNOWN)])
+        k, s, spent, (rows, slips0, single, age, work, slips, had) = int(head[0]), 1 + self.m, head[2], head[6:]
         self.fit(k)
-        self.tally[:2] = head[3:5]
+        self.tally[:2] = head[4:6]
         arrays: tuple[NDArray[Any], ...]
         arrays = self.x, self.y, self.kind, self.e, self.kind0, self.e0, self.before, self.before_y
         parts = np.split(numbers, np.cumsum([array.size for array in arrays]))
@@ -281,13 +283,16 @@ class Coulomb(Rounds):
             array[:] = parts[i].reshape(array.shape)
         if self.f is None or not k:
             return
+        self.f.slips, self.f.had = int(slips), int(had)
         self._use(bool(single))
+        if head[1] != k * s:  # nodes came since, of which the next call makes a new factor
+            return
         self.inverse.of(W, k * s)
         self.inverse.spent = spent
-        if head[2]:
+        if head[3]:
             self.inverse.make()
-        self._point(W=W, mu=mu)
-        self.f.ld, self.f.slips, self.f.had = W.shape[1], int(slips), int(had)
+        self._point(W=W)
+        self.mu[:], self.f.ld = mu, W.shape[1]
         self._matrices()
         if rows:
             kind, e = self.kind.copy(), self.e.copy()
