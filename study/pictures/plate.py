@@ -10,6 +10,7 @@ from softgrasp.study.pictures.shapes import facet_normals, seen, view_direction
 
 THICK = 0.09  # of the smallest side of the body
 PAD = 0.04  # of the frame, free around the body
+WIDE = 0.16  # the same with obstacles, for the part of a plane that is drawn
 
 
 def held_facets(picture: PictureMesh) -> NDArray[np.bool_]:
@@ -50,5 +51,5 @@ def around_bodies(picture: PictureMesh, states: Array, hands: Array) -> list[tup
         behind, before = hand_plate(picture, q)
         points = seen(np.vstack([picture.points + u, *behind, *before]))
         boxes.append((points.min(axis=0), points.max(axis=0)))
-    half = (0.5 + PAD) * np.max([high - low for low, high in boxes], axis=0)
+    half = (0.5 + (WIDE if picture.obstacles else PAD)) * np.max([high - low for low, high in boxes], axis=0)
     return [((low + high) / 2 - half, (low + high) / 2 + half) for low, high in boxes]
