@@ -142,7 +142,7 @@ class Time(Section):
     reproducible: Literal["auto"] | bool = Field(
         "auto",
         description="equal bits in every run on the same number of ranks: each stores the whole factor [no unit];  "
-        "auto: on up to 4 ranks, in 3D to 40 000 unknowns over the number of ranks; true needs about twice the time of "
+        "auto: on up to 4 ranks, in 3D to 20 000 unknowns over the number of ranks; true needs about twice the time of "
         "a spread factor beyond, and the memory of the whole one on each rank",
     )
 

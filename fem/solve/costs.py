@@ -37,8 +37,9 @@ ENTRIES = {(2, 1): 14, (2, 2): 23, (2, 3): 34, (2, 4): 46, (3, 1): 40, (3, 2): 7
 PER_ENTRY = 1e-9  # time of an entry in a product [s]
 # Unknowns times ranks up to which every rank stores the whole factor of MUMPS, and ranks. On two ranks a spread one
 # needs 0.68 and 0.65 of the time for solve and set-up at 2e4 unknowns in 3D; a whole one on each 1.4 and 1.2, and the
-# memory of one for each, the price of the same bits. In 2D blocks on every rank beat MUMPS.
-REPEATED_LIMIT = {2: 1_000_000, 3: 40_000}
+# memory of one for each, the price of the same bits. Of a whole run with 12 270 unknowns two ranks take 0.94 with a
+# spread factor, 1.3 with whole ones. In 2D blocks on every rank beat MUMPS.
+REPEATED_LIMIT = {2: 1_000_000, 3: 20_000}
 REPEATED_RANKS = 4
 # Unknowns from which ranks factor a subtree each in 2D: a solve with 1e5 takes 6.9 ms on two ranks, 11.3 on one, and
 # 12.7 where both have the whole factor; below, the messages and the sum of a step take as long.
