@@ -75,6 +75,7 @@ class Problem:
     sag: Sag  # the tissue at rest under its weight
     # gradient of the linear static response to the largest acceleration of the hand, and to gravity if on
     response: Gradient
+    clear: bool = False  # whether the path of the hand keeps the deformed tissue clear of every obstacle, by estimate
 
 
 class Effect(ABC):

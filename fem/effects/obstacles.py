@@ -19,7 +19,7 @@ class ObstaclesEffect(Effect):
         return ("columns of S^-1 N', or of their first sweep",) if self.active(scene) else ()
 
     def gate(self, problem: Problem) -> Gate:
-        """Number of obstacles; only a run determines whether the tissue gets there."""
+        """Number of obstacles, and whether the path of the hand leads near them; only a run determines a touch."""
         from softgrasp.fem.obstacles.spacing import MOST, base_parts  # few scenes need it
 
         scene, entries = problem.scene, problem.scene.obstacle or []
@@ -37,4 +37,6 @@ class ObstaclesEffect(Effect):
             if self.active(scene)
             else "Off; the tissue goes through the obstacles that control plans around."
         )
-        return Gate(number, "number of obstacles", self.threshold, number > self.threshold, sentence)
+        clear = self.active(scene) and problem.clear
+        beside = "the path of the hand stays clear of them" if clear else ""
+        return Gate(number, "number of obstacles", self.threshold, number > 0 and not clear, sentence, condition=beside)

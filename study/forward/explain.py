@@ -227,6 +227,8 @@ def _explained(scene: Scene, looked: Model, sizes: ModelSizes, model: Model | No
     else:
         omega, Phi = np.zeros(0), np.zeros((small.layout.n_local, 0))
     problem = measure(looked, omega, Phi, largest_acceleration(scene, sizes.n_s, small.M_hand))
+    away = out_of_reach(looked, problem.response.rms, problem.length)
+    problem = replace(problem, clear=bool(away))
     reports = {
         key: EffectReport(e.active(scene), e.term, e.operators(scene), e.cost, e.gate(problem))
         for key, e in EFFECTS.items()
@@ -259,7 +261,7 @@ def _explained(scene: Scene, looked: Model, sizes: ModelSizes, model: Model | No
             *(looked if model is None else model).space.mesh.notes,
             *_warnings(scene, poisson, omega, dt, d, reports, problem.sag),
             *small_obstacles(looked if model is None else model, _shrunk(scene, looked) if model is None else 1.0),
-            *out_of_reach(looked, problem.response.rms, problem.length),
+            *away,
         ),
         outputs=output_places(looked if model is None else model),
         memory=need(scene, d, sizes.cells, ranks, free, run=True),

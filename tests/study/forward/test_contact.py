@@ -100,7 +100,10 @@ def test_explain_advises_to_drop_obstacles_that_the_path_stays_clear_of(offset: 
     move = "motion={target=[0.1, -0.3], duration=1.0}"
     table = f"obstacle=[{{kind='halfspace', normal=[0, 1], offset={offset}}}]"
     model = build("paper_forward", [*SCENE[:1], move, *SCENE[2:-1], table])
-    texts = [text for text in explain_model(model).warnings if "stays" in text]
+    explained = explain_model(model)
+    texts = [text for text in explained.warnings if "stays" in text]
+    assert explained.effects["obstacles"].gate.matters == (offset > -1)
+    assert explained.idle == (("obstacles",) if offset == -5 else ())
     touched = simulate(model).contact
     assert touched is not None
     assert len(texts) == (offset == -5)
