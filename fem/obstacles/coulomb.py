@@ -294,7 +294,7 @@ class Coulomb(Rounds):
         self._point(W=W)
         self.mu[:], self.f.ld = mu, W.shape[1]
         self._matrices()
-        if rows:
+        if rows and (len(self.inverse.made) or not slips0):  # else W was refused an inverse since
             kind, e = self.kind.copy(), self.e.copy()
             self.kind[:], self.e[:], self.f.slips = self.kind0, self.e0, int(slips0)
             self._factor()

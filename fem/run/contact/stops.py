@@ -88,6 +88,8 @@ class Stops:
             self.reach[new] = impulses.reach_of(row[new, 1].astype(np.intp), along[new])
             answers = np.einsum("ij,kj->ki", np.linalg.inv(impulses.H), self.reach[new])
             more += np.einsum("ik,jk->ij", self.reach[:count], answers)
+        both = more[new]  # of pairs of new rows the entry above the diagonal counts, as if they came one by one
+        both[:] = np.triu(both) + np.triu(both, 1).T
         self.A[:count, new], self.A[new, :count] = more, more.T
         f.struck = count
         contact.point(column=at.astype(np.intc), starts=self._starts())

@@ -242,14 +242,22 @@ def test_every_step_of_friction_takes_energy(monkeypatch: pytest.MonkeyPatch) ->
     assert taken[-1] > 1e-4
 
 
-@pytest.mark.parametrize("obstacle", [table(0.4), DISC])
-def test_restart_in_friction_repeats_the_bits(obstacle: str, mpi_tmp_path: Path) -> None:
-    overrides = [*SMALL, BETA, SIDE, obstacle]
+@pytest.mark.parametrize(
+    ("scene", "until"),
+    [
+        ([SIDE, table(0.4)], 70),
+        ([SIDE, DISC], 70),
+        ([SIDE, table(0.3)], 15),  # when the last step has met nodes that the one before has not
+        ([*DRIVEN, table(0.3)], 29),  # whose nodes came one after the other
+    ],
+)
+def test_restart_in_friction_repeats_the_bits(scene: list[str], until: int, mpi_tmp_path: Path) -> None:
+    overrides = [*SMALL, BETA, *scene]
     whole = simulate(build("paper_forward", overrides))
     with pytest.raises(Paused):
-        simulate(build("paper_forward", overrides), RunOptions(mpi_tmp_path, until=70))
+        simulate(build("paper_forward", overrides), RunOptions(mpi_tmp_path, until=until))
     again = simulate(build("paper_forward", overrides), RunOptions(mpi_tmp_path, resume=True))
-    assert whole.contact.touching[:70].max() > 0
+    assert whole.contact.touching[:until].max() > 0
     assert np.array_equal(again.final, whole.final)
     assert np.array_equal(again.contact.force, whole.contact.force)
     assert again.contact.rubbed == whole.contact.rubbed
