@@ -28,7 +28,7 @@
 enum { OPEN, STICK, SLIP };
 enum { HERE, OPENED, FIRST };
 enum { SOLVED = 0, WANTED = 1, CYCLED = 2, DRIFTED = 3 }; /* the last: W^-1 is too inexact */
-enum { KEPT = 24, DRIFTS = 3, PATIENCE = 12 }; /* steps of a round, refinements of W^-1, rounds without gain, at most */
+enum { KEPT = 24, DRIFTS = 3, PATIENCE = 25 }; /* steps of a round, refinements of W^-1, rounds without gain, at most */
 static const double RIDGE_SINGLE = 1e-7; /* as RIDGE, of a factor in single precision */
 static const double READ = 2e10, FLOPS = 5e10, CALL = 3e-5; /* bytes and operations per second, seconds of a call: what
                                                                steps and factors cost in proportion */
