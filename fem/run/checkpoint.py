@@ -53,7 +53,7 @@ class RestartState:
     snapshots: Array  # stored states of this rank's nodes, one a column
     loads: Array  # coefficients c of the load G c of each step so far, (n, n_s)
     pulls: Array  # products G'w of each step so far, (n + 1, n_s or 2 n_s); c'G'w is half the work of the load
-    energies: Array  # dissipated, initial and largest energy, (3,) [J]
+    energies: Array  # dissipated energy, and that at the start, (2,) [J]
     residual_first: float  # relative residual of the first solve [1]
     taken: Array | None = None  # energy dissipated here, and work of contact, so far, (n + 1, 2) [J]; None without both
     forces: Array | None = None  # force on the hand so far, (n, n_s) [N, N m]; None where the motion is prescribed

@@ -26,7 +26,6 @@ class Ledger:
         pulls: products G'w of each step on the rows here, (steps + 1, n_s or 2 n_s).
         taken: energy dissipated on the rows here, and work of contact, up to each time [J]; None where both are zero.
         first: energy at the start [J].
-        peak: largest energy that was sampled [J].
     """
 
     def __init__(self, midpoint: TissueMidpoint, loads: Array, contact: Contact | None = None) -> None:
@@ -35,7 +34,7 @@ class Ledger:
         self.pulls = np.zeros((rows, len(midpoint.pull())))
         counts = midpoint.system.damping.active or contact is not None
         self.taken = np.zeros((rows, 2)) if counts else None
-        self.first = self.peak = 0.0
+        self.first = 0.0
 
     def record(self, n: int) -> None:
         """Keep pull and dissipation of the step that ends at time n. Not collective."""
@@ -48,13 +47,6 @@ class Ledger:
     def start(self, state: TissueState) -> None:
         """Keep the energy of the first state. Collective."""
         self.first = self._energy(state)
-        self.sample(state)
-
-    def sample(self, state: TissueState) -> float:
-        """Energy of a state, for the scale of the drift [J]. Collective."""
-        energy = self.midpoint.energy(state)
-        self.peak = max(self.peak, abs(energy))
-        return energy
 
     def _energy(self, state: TissueState) -> float:
         """Energy of a state to as many digits as there are [J]. Collective."""
@@ -70,10 +62,11 @@ class Ledger:
         return self.midpoint.over_ranks(work) + contact, self.midpoint.over_ranks(self.midpoint.dissipated)
 
     def drift(self, state: TissueState, n: int) -> float:
-        """Energy at step n that neither load nor damping explains, over the largest energy seen. Collective."""
+        """Energy at step n that neither load nor damping explains, over the largest until then. Collective."""
+        largest = float(np.abs(self.over_time()[0][: n + 1]).max())
         work, lost = self.balance(n)
         defect = self._energy(state) - self.first - work + lost
-        scale = max(self.peak, abs(work), abs(lost))
+        scale = max(largest, abs(work), abs(lost))
         return abs(defect) / scale if scale > 0 else 0.0
 
     def over_time(self) -> tuple[Array, Array]:

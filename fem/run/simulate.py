@@ -140,6 +140,7 @@ class Run(Stepped):
         self.midpoint.start(self.state)
         self.record(0)
         self.ledger.start(self.state)
+        self.watch_energy()
 
     def _equilibrium(self) -> Array:
         """Static displacement against the hand, (n_local,) [m]. Collective."""
@@ -184,8 +185,8 @@ class Run(Stepped):
         return force_taken(self.model.system, pulls[1:], self.drive.v, self.drive.c, self.dt, kicks) - hand
 
     def watch_energy(self) -> None:
-        """Sample the energy for the scale of the drift, and stop a run that is no longer finite. Collective."""
-        if not np.isfinite(self.ledger.sample(self.state)):
+        """Stop a run whose energy is no longer finite. Collective."""
+        if not np.isfinite(self.midpoint.energy(self.state)):
             raise SolverError(
                 f"{self.solver[0]}: the energy is not finite at step {self.reached}; check material, dt and force"
             )
@@ -208,7 +209,7 @@ class Run(Stepped):
             loads=self.drive.c[:n],
             pulls=ledger.pulls[: n + 1],
             taken=None if ledger.taken is None else ledger.taken[: n + 1],
-            energies=np.array([midpoint.dissipated, ledger.first, ledger.peak]),
+            energies=np.array([midpoint.dissipated, ledger.first]),
             residual_first=self.residual_first,
             forces=None if self.drive.u is None else self.drive.u[:n],
             **midpoint.restart_arrays(),
@@ -239,7 +240,7 @@ class Run(Stepped):
             ledger.taken[: n + 1] = saved.taken
         if self.drive.u is not None and saved.forces is not None:
             self.drive.u[:n] = saved.forces
-        midpoint.dissipated, ledger.first, ledger.peak = saved.energies.tolist()
+        midpoint.dissipated, ledger.first = saved.energies[:2].tolist()
         self.residual_first, self.reached, self.begun = saved.residual_first, n, n
         self.legs = [*(leg for leg in saved.legs if leg < n), n]
         for vector in (self.state.z, self.state.v, midpoint.r):

@@ -119,7 +119,7 @@ class Trajectory(Shown, FullOrderRun):
     final: Array
     """State [z; v_z] of this rank's nodes at the end, (2 n_local,) [m; m/s]."""
     energy_drift: float
-    """|E_N - E_0 - work + dissipated| over the largest sampled energy, E from the momentum of linear steps [1]."""
+    """|E_N - E_0 - work + dissipated| over the largest energy, E from the momentum of linear steps [1]."""
     residuals: tuple[float, float]
     """Relative residuals of the first and of the last solve [1]."""
     solver: SolverUsed
