@@ -5,7 +5,7 @@
 y_t half the slip of the step; a node has one tangent in 2D and two in 3D. Newton's method on the sets open, stick
 and slip [AC91]: in 2D it is exact when the sets stay, in 3D the directions of slipping nodes converge with it. The
 unknowns of its equations are forces of pressed nodes or, once factors have cost as much as W^-1, slips of slipping
-nodes, of which there are fewer; conjugate residuals solve them from a factor of earlier sets, until a new one costs
+nodes, which are fewer; conjugate residuals [EES83] solve them from a factor of earlier sets, until a new one costs
 less. For many nodes factors and these steps are in single precision, unless this leads nowhere. Where the method comes
 back to sets seen before, sweeps of Gauss-Seidel find others; then pivots do (`lemke.py`), which in 2D end at a solution
 but for rounding, and in 3D lead to one by pyramids with edges nearer and nearer to the slips, or friction that grows.
