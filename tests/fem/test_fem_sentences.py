@@ -28,7 +28,8 @@ from softgrasp.fem.model import contact
 from softgrasp.fem.obstacles import small
 from softgrasp.fem.obstacles.coulomb import Coulomb
 from softgrasp.fem.reduced import ReducedSystem
-from softgrasp.fem.run import checkpoint, snapshots
+from softgrasp.fem.run import checkpoint
+from softgrasp.fem.run import streamed as streamed_snapshots
 from softgrasp.fem.run.contact import rest
 from softgrasp.fem.run.contact.finite import FiniteContactMidpoint
 from softgrasp.fem.run.frame.midpoint import LinearTurningStep
@@ -373,7 +374,7 @@ SENTENCES: list[tuple[Act, str]] = [
     (in_the_way("snapshots.h5"), "; remove it or free the disk"),
     (streamed(other_file), "snapshots-rank0.h5 has (1, 1) numbers, this run needs (5, "),
     (streamed(unsealed), "snapshots-rank0.h5 is damaged (its numbers have no checksums); run again without --resume"),
-    (full_disk(snapshots, "reserve_room", "output.snapshots='hdf5'"),
+    (full_disk(streamed_snapshots, "reserve_room", "output.snapshots='hdf5'"),
      "snapshots-rank0.h5 cannot be written ([Errno 28]"),
     (full_disk(checkpoint, "write_manifest", until=2),
      "checkpoint.json cannot be written ([Errno 28] No space left on "),
