@@ -20,7 +20,7 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.scene.obstacles import Obstacle, obstacle_names
 
-STIFF = 0.45  # P1 displacements lock above: the error grows like 1 / (1 - 2 nu) = lambda / mu + 1 [BS92]
+STIFF = 0.45  # P1 displacements lock from there on: the error grows like 1 / (1 - 2 nu) = lambda / mu + 1 [BS92]
 LOCKING = 0.49  # where `effects` measures it
 COARSE_STEP = 0.05  # dt / T_1: the midpoint rule lengthens a period by (omega dt)^2 / 12, here 0.8 %
 SMALL_ANGLE = 0.1  # [rad]: a linearised rotation stretches by angle^2 / 2, here 0.5 %
@@ -41,10 +41,10 @@ def poisson_ratios(system: BlockSystem) -> dict[str, float]:
 def locking(poisson: dict[str, float], order: int) -> list[str]:
     """P1 elements in a material that hardly changes its volume."""
     return [
-        f"nu = {_near_half(nu)} of {name} is above {STIFF}: P1 locks, its error grows with lambda / mu = "
+        f"nu = {_near_half(nu)} of {name} is {STIFF} or more: P1 locks, its error grows with lambda / mu = "
         f"{2 * nu / (1 - 2 * nu):.3g}; use tissue.order = 2, on half the cells along each edge for as many unknowns."
         for name, nu in poisson.items()
-        if nu > STIFF + 1e-9 and order == 1
+        if nu > STIFF - 1e-9 and order == 1
     ]
 
 
