@@ -20,7 +20,7 @@ from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.model.build import Model, Stopwatch, build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.lqr.design.feedback import Design, design

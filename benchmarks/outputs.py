@@ -16,7 +16,7 @@ from benchmarks.driver import Goal
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.reduction.certified.certificate import CertifiedRun
 from softgrasp.reduction.certified.model import CertifiedModel

@@ -44,15 +44,15 @@ if TYPE_CHECKING:
     from softgrasp.fem.petsc import PETSc, on_root, total
     from softgrasp.fem.reduced import ReducedSystem
     from softgrasp.fem.resources import free_memory, size_text
-    from softgrasp.fem.run.checkpoint import check_ranks
     from softgrasp.fem.run.forecast import Forecast, forecasts, told
-    from softgrasp.fem.run.frames import FRAMES, frame_count, frame_steps
     from softgrasp.fem.run.interrupt import interruptible
     from softgrasp.fem.run.motion import Profile, largest_acceleration, motion_table
     from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-    from softgrasp.fem.run.snapshots import spread
+    from softgrasp.fem.run.states.checkpoint import check_ranks
+    from softgrasp.fem.run.states.frames import FRAMES, frame_count, frame_steps
+    from softgrasp.fem.run.states.snapshots import spread
+    from softgrasp.fem.run.states.trajectory import Trajectory
     from softgrasp.fem.run.stepping import make_ts
-    from softgrasp.fem.run.trajectory import Trajectory
     from softgrasp.fem.scene.control import Loop, Reduction
     from softgrasp.fem.scene.file import find_scene, load_scene, load_scene_collective, resolved_toml
     from softgrasp.fem.scene.materials import LIBRARY, young_poisson

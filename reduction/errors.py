@@ -19,7 +19,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, times_columns, total
-from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.states.snapshots import Snapshots
 from softgrasp.fem.shown import Card, Shown, percent
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.engines import factor

@@ -19,7 +19,7 @@ from softgrasp.reduction.system import EnergySystem, ModelError, Outputs
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
-    from softgrasp.fem.run.trajectory import Trajectory
+    from softgrasp.fem.run.states.trajectory import Trajectory
 
 
 def check_materials(materials: tuple[LayerMaterial, ...], own: tuple[LayerMaterial, ...], damped: bool) -> None:

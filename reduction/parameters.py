@@ -11,7 +11,7 @@ import numpy as np
 from softgrasp.fem.material import LayerMaterial, scaled
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.states.snapshots import Snapshots
 from softgrasp.fem.shown import digits
 from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.replay import FullRun, full_run

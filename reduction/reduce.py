@@ -7,7 +7,7 @@ from numbers import Integral
 from typing import TYPE_CHECKING, overload
 
 from softgrasp.fem.errors import shortened
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.reduction.bases.basis import Basis, ReductionError
 from softgrasp.reduction.bases.engines import EngineName
 from softgrasp.reduction.bases.inner import InnerName

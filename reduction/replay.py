@@ -11,8 +11,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.snapshots import Snapshots
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.snapshots import Snapshots
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.reduction import online
 from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.errors import ModelComparison, ModelErrors, full_energy, shown_rows, state_rows, with_hand

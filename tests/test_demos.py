@@ -20,7 +20,7 @@ LONG = ("demo_own_basis", "demo_certified", "demo_finite_strain", "demo_arm")  #
 )
 def test_demo(path: Path, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without figures, which cost more than the rest; `make docs` and tests/test_shown.py draw them."""
-    monkeypatch.setattr("softgrasp.fem.run.trajectory.drawn", lambda *of: None)
+    monkeypatch.setattr("softgrasp.fem.run.states.trajectory.drawn", lambda *of: None)
     monkeypatch.chdir(mpi_tmp_path)
     runpy.run_path(str(path), run_name="__main__")
 

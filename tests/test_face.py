@@ -18,7 +18,7 @@ import pytest
 
 import softgrasp as sg
 from softgrasp._face import names_of
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.shown import Shown
 from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.reduction.certified.model import CertifiedModel

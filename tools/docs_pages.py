@@ -40,7 +40,7 @@ SHORT = 12  # letters of a cell that stays in one line
 ROOMS = {"fem": "Scene, model, run", "reduction": "Reduced models", "lqr": "Control", "study": "Many runs"}
 MORE = {
     "study": ["study.runs.sweep.SweepTable", "study.notebook.Film"],
-    "fem": ["fem.run.trajectory.Trajectory", "fem.run.simulate.RunOptions", "fem.fields.series.SeriesWriter"],
+    "fem": ["fem.run.states.trajectory.Trajectory", "fem.run.simulate.RunOptions", "fem.fields.series.SeriesWriter"],
     "reduction": [
         "reduction.bases.registry.METHODS",
         "reduction.online.ReducedTrajectory",

@@ -16,9 +16,9 @@ from softgrasp.fem.resources import free_memory, size_text
 from softgrasp.fem.run.midpoint import TissueState, state_on
 from softgrasp.fem.run.motion import ForceDrive, HandTable, TableDrive, driven_table
 from softgrasp.fem.run.simulate import Run, RunOptions
-from softgrasp.fem.run.snapshots import NoStore
+from softgrasp.fem.run.states.snapshots import NoStore
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.run.stepping import make_ts
-from softgrasp.fem.run.trajectory import Trajectory
 
 SHARE = 0.5  # of the free memory that all states may take; the rest is for those who come later
 

@@ -14,7 +14,7 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.model.build import Model, Stopwatch, checked_model
 from softgrasp.fem.petsc import Array, on_root
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.trajectory import Trajectory
 
 
 def full_gradient(

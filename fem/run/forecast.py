@@ -16,7 +16,7 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.memory import factor_bytes, free_bytes, need, steps_of
 from softgrasp.fem.resources import size_text
-from softgrasp.fem.run.frames import frame_count
+from softgrasp.fem.run.states.frames import frame_count
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.costs import BUILD, ENTRIES, ITERATIVE, SolverName, seams
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.run.inexact import InexactMidpoint
 from softgrasp.fem.run.midpoint import TissueMidpoint
-from softgrasp.fem.run.snapshots import MemoryStore, NoStore
+from softgrasp.fem.run.states.snapshots import MemoryStore, NoStore
 from softgrasp.fem.solve.costs import STEP_RTOL
 from softgrasp.fem.solve.solvers import ITERATIVE, Reproducible, SolverName
 from softgrasp.fem.system import BlockSystem
@@ -65,7 +65,7 @@ def make_store(
     if kind in ("auto", "memory"):
         return MemoryStore(system, steps, every, few if kind == "auto" else None)
     if kind == "hdf5":
-        from softgrasp.fem.run.streamed import Hdf5Store  # brings h5py
+        from softgrasp.fem.run.states.streamed import Hdf5Store  # brings h5py
 
         return Hdf5Store(system, steps, every, directory, run)
     return NoStore(system)

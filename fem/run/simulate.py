@@ -27,14 +27,14 @@ from softgrasp.fem.model.memory import solver_of
 from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.owned import locked
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
-from softgrasp.fem.run.frames import boundaries, output_recorders
 from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.run.ledger import Ledger
 from softgrasp.fem.run.make import make_midpoint, make_store
 from softgrasp.fem.run.motion import Force, ForceDrive, TableDrive, force_taken, force_values, free_table
+from softgrasp.fem.run.states.checkpoint import RestartState, read_checkpoint, write_checkpoint
+from softgrasp.fem.run.states.frames import boundaries, output_recorders
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.run.stepping import Stepped, make_ts
-from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
 

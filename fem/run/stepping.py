@@ -12,7 +12,7 @@ from softgrasp.fem.errors import SoftgraspError, SolverError
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
-from softgrasp.fem.run.snapshots import NoStore
+from softgrasp.fem.run.states.snapshots import NoStore
 from softgrasp.fem.solve.solvers import SolverUsed
 
 

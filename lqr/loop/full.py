@@ -17,9 +17,9 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.ledger import Ledger
 from softgrasp.fem.run.make import make_midpoint, make_store
-from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.states.snapshots import Snapshots
+from softgrasp.fem.run.states.trajectory import FullOrderRun
 from softgrasp.fem.run.stepping import Stepped, make_ts
-from softgrasp.fem.run.trajectory import FullOrderRun
 from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
 from softgrasp.fem.solve.solvers import Reproducible, SolverUsed, choose_solver
 from softgrasp.lqr.loop.actuation import Actuation

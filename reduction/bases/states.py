@@ -11,7 +11,7 @@ from mpi4py import MPI
 from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, rows_on_all, times_columns, total, whole_copy
-from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.states.snapshots import Snapshots
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError
 

@@ -14,7 +14,7 @@ from softgrasp.reduction.system import ModelError
 
 if TYPE_CHECKING:  # a reduced model loads no mesh
     from softgrasp.fem.model.build import Model
-    from softgrasp.fem.run.trajectory import Trajectory
+    from softgrasp.fem.run.states.trajectory import Trajectory
 
 
 @overload

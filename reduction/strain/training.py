@@ -27,7 +27,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.petsc import Array, PETSc, on_root, times_columns, total
-from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.states.snapshots import Snapshots
 from softgrasp.fem.shown import Card, Shown, percent
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import ReductionError

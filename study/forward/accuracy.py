@@ -15,7 +15,7 @@ from softgrasp.study.report import percent
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import MeshEstimate, Model
-    from softgrasp.fem.run.trajectory import Trajectory
+    from softgrasp.fem.run.states.trajectory import Trajectory
 
 NOT_LINEAR = "The error of mesh and time step is estimated for linear elasticity only"
 

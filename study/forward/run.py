@@ -26,8 +26,8 @@ from softgrasp.fem import (
 from softgrasp.fem.accuracy.price import SHARE
 from softgrasp.fem.errors import Interrupted, Paused, ResourceError, SceneError, SolverError
 from softgrasp.fem.run.forecast import Forecast
-from softgrasp.fem.run.frames import LIGHT
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.states.frames import LIGHT
 from softgrasp.study.forward.accuracy import accuracy_report, check_estimated, estimate_error
 from softgrasp.study.forward.cautions import looked_at, run_warnings, small_obstacles
 from softgrasp.study.forward.result import Simulation, simulate_result

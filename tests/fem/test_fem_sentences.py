@@ -28,12 +28,12 @@ from softgrasp.fem.model import contact
 from softgrasp.fem.obstacles import small
 from softgrasp.fem.obstacles.coulomb import Coulomb
 from softgrasp.fem.reduced import ReducedSystem
-from softgrasp.fem.run import checkpoint
-from softgrasp.fem.run import streamed as streamed_snapshots
 from softgrasp.fem.run.contact import rest
 from softgrasp.fem.run.contact.finite import FiniteContactMidpoint
 from softgrasp.fem.run.frame.midpoint import LinearTurningStep
 from softgrasp.fem.run.simulate import RunOptions
+from softgrasp.fem.run.states import checkpoint
+from softgrasp.fem.run.states import streamed as streamed_snapshots
 from softgrasp.fem.scene.text import BYTES
 from softgrasp.fem.solve import modes, solvers
 from tests.helpers.sentences import refused

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import softgrasp.fem.run.checkpoint
+import softgrasp.fem.run.states.checkpoint
 from softgrasp.fem import _stack as _stack
 from softgrasp.fem.run.simulate import Run
 from softgrasp.fem.scene.file import shipped_scenes
@@ -39,7 +39,7 @@ def inject(fault: str) -> None:
         step(run, ts)
 
     if fault == "disk":
-        vars(softgrasp.fem.run.checkpoint)["write_arrays"] = disk
+        vars(softgrasp.fem.run.states.checkpoint)["write_arrays"] = disk
     elif fault:
         Run.step = faulty  # type: ignore[method-assign,assignment]
 

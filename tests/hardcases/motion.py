@@ -19,8 +19,8 @@ from softgrasp.fem.petsc import Array, to_scipy
 from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.midpoint import midpoint_matrix, state_on
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.run.stepping import make_ts
-from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.statics import equilibrium
 from softgrasp.fem.strain.body import HyperelasticBody

@@ -17,7 +17,7 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import force_values
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.states.snapshots import Snapshots
 from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.bases.inner import orthonormality
 from softgrasp.reduction.bases.registry import make_bases, make_basis

@@ -11,7 +11,7 @@ import scipy.linalg
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import times_columns, total
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.certified.certificate import CertifiedRun

@@ -14,7 +14,7 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import total
 from softgrasp.fem.run.motion import force_values
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.model import ReducedModel

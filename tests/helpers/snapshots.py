@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.states.snapshots import Snapshots
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.bases.inner import InnerName, Rows
 from softgrasp.reduction.bases.registry import METHODS

@@ -12,7 +12,7 @@ import pytest
 
 import softgrasp as sg
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.reduction.archive import write_checksums
 from softgrasp.reduction.bases.registry import make_basis

@@ -16,7 +16,7 @@ import ufl
 from mpi4py import MPI
 
 import softgrasp as sg
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.bases.pod import cholesky_of
 from softgrasp.reduction.bases.truncation import Truncation

@@ -16,7 +16,7 @@ from softgrasp.fem.model.surface import Surface, make_surface, node_distance
 from softgrasp.fem.obstacles import HalfSpace, Obstacle, make_obstacles
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import motion_table
-from softgrasp.fem.run.snapshots import spread
+from softgrasp.fem.run.states.snapshots import spread
 from softgrasp.fem.solve.costs import SolverName
 
 INSTANTS = 200  # of a prescribed motion, at which gaps are computed

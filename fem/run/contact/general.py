@@ -366,7 +366,7 @@ class Contact:
         )  # fmt: skip
 
     def restart_arrays(self) -> dict[str, Array]:
-        """Record and sets of a restart file, see :class:`softgrasp.fem.run.checkpoint.RestartState`."""
+        """Record and sets of a restart file, see :class:`softgrasp.fem.run.states.checkpoint.RestartState`."""
         keys = self.responses.keys[: self.responses.count]
         parts: list[NDArray[Any]] = [
             self.table.energy, np.array([self.fastest]), self.small.tally, keys.ravel(),

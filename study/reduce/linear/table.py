@@ -19,7 +19,7 @@ from softgrasp.study.reduce.linear.result import POINT_UNITS, MethodSweep, Point
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
-    from softgrasp.fem.run.trajectory import Trajectory
+    from softgrasp.fem.run.states.trajectory import Trajectory
 
 NUMBERS = tuple(f.name for f in fields(Point) if f.name not in ("N", "split", "stable"))
 

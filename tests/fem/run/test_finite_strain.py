@@ -17,9 +17,9 @@ from softgrasp.fem.checksums import read_manifest, write_manifest
 from softgrasp.fem.errors import CheckpointError, Interrupted, Paused, SolverError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import total
-from softgrasp.fem.run.checkpoint import FORMAT
 from softgrasp.fem.run.simulate import RunOptions, simulate
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.checkpoint import FORMAT
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.solve.statics import equilibrium
 from tests.helpers.models import (
     CUBE,

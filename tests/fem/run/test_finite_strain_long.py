@@ -15,7 +15,7 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.scales import gradient
 from softgrasp.fem.petsc import times_columns
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.trajectory import Trajectory
 
 pytestmark = [pytest.mark.slow, pytest.mark.serial]
 MATERIALS = [(50, 50), (30, 30), (200, 30), (60, 120), (40, 40), (120, 45), (50, 80)]

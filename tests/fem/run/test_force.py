@@ -12,8 +12,8 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import HandTable, TableDrive, force_values
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.run.stepping import make_ts
-from softgrasp.fem.run.trajectory import Trajectory
 from tests.fem.run.test_midpoint import DRAGGED, GRAVITY, LAYERED, RAYLEIGH, SAME_RUN, TINY, VISCOUS
 from tests.helpers.models import CUBE, absolute, close, first_order, make_scene, reference, same_everywhere, wave
 

@@ -14,9 +14,9 @@ from softgrasp.fem.errors import CheckpointError, Paused, SceneError, SolverErro
 from softgrasp.fem.model.build import build
 from softgrasp.fem.obstacles.coulomb import Coulomb
 from softgrasp.fem.obstacles.lemke import pyramid_forces
-from softgrasp.fem.run.checkpoint import FORMAT
 from softgrasp.fem.run.contact.friction import FlatFriction
 from softgrasp.fem.run.simulate import RunOptions, simulate
+from softgrasp.fem.run.states.checkpoint import FORMAT
 from softgrasp.fem.scene.file import load_scene
 
 SMALL = [

@@ -13,8 +13,8 @@ from softgrasp.fem.errors import Interrupted
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.inexact import InexactMidpoint
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.run.stepping import make_ts
-from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.solve.guess import Previous
 from tests.helpers.random_scenes import write_scene
 

@@ -19,9 +19,9 @@ from softgrasp.fem.checksums import read_manifest, write_arrays, write_manifest
 from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.resources import MARGIN, check_room
-from softgrasp.fem.run.checkpoint import FORMAT
 from softgrasp.fem.run.simulate import RunOptions, simulate
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.checkpoint import FORMAT
+from softgrasp.fem.run.states.trajectory import Trajectory
 from tests.helpers.models import make_scene
 
 pytestmark = pytest.mark.ranks
@@ -147,7 +147,7 @@ def test_snapshots_stream_through_the_smallest_buffer(
     comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int
 ) -> None:
     """A column larger than the buffer, and a stride longer than the run."""
-    monkeypatch.setattr("softgrasp.fem.run.streamed.BUFFER_BYTES", 1)
+    monkeypatch.setattr("softgrasp.fem.run.states.streamed.BUFFER_BYTES", 1)
     run(mpi_tmp_path, output={"snapshots": "hdf5", "every": every})
     memory = run(mpi_tmp_path, output={"every": every}).snapshots
     assert memory is not None
@@ -187,7 +187,7 @@ def test_room_that_is_gone_when_it_is_taken_ends_all_ranks(
     comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As with a quota, which no question for free room shows: HDF5 itself would end the program."""
-    monkeypatch.setattr("softgrasp.fem.run.streamed.check_room", lambda *_: None)
+    monkeypatch.setattr("softgrasp.fem.run.states.streamed.check_room", lambda *_: None)
 
     def refuse(file: int, at: int, size: int) -> None:
         assert size > 0

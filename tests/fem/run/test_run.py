@@ -18,9 +18,9 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError, SceneError, SolverError
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.run.checkpoint import FORMAT
 from softgrasp.fem.run.midpoint import TissueMidpoint
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.states.checkpoint import FORMAT
 from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.solve.solvers import TissueSolver
@@ -56,7 +56,7 @@ def test_restart_leaves_the_same_streamed_snapshots(
 ) -> None:
     extra = ('output.snapshots="hdf5"', "output.every=3")
     monkeypatch.setattr(
-        "softgrasp.fem.run.streamed.BUFFER_BYTES", 20_000
+        "softgrasp.fem.run.states.streamed.BUFFER_BYTES", 20_000
     )  # a few columns: the buffer is filled several times
     simulate(small(comm, *extra), RunOptions(directory=mpi_tmp_path / "whole"))
     with pytest.raises(Interrupted):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.states.snapshots import Snapshots
 from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.reduction.bases.engines import ENGINES, EngineName
 from softgrasp.reduction.bases.inner import INNERS, InnerName, orthonormality

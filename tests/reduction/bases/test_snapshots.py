@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.states.snapshots import Snapshots
 from softgrasp.reduction.bases.inner import INNERS, InnerName
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS, make_basis
 from softgrasp.reduction.bases.states import BasisError, States, states_of

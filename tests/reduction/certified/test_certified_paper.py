@@ -14,7 +14,7 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.certified.archive import load_certified, save_certified

@@ -13,8 +13,8 @@ from rich.console import Console
 
 from softgrasp.fem.errors import CheckpointError, Interrupted
 from softgrasp.fem.model.build import build
-from softgrasp.fem.run.frames import frame_count, frame_steps
 from softgrasp.fem.run.simulate import RunOptions, simulate
+from softgrasp.fem.run.states.frames import frame_count, frame_steps
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.study.forward import run as forward
 from softgrasp.study.forward.cautions import looked_at, run_warnings

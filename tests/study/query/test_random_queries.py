@@ -22,7 +22,7 @@ from rich.console import Console
 from softgrasp.fem.columns import label_unit
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes

@@ -10,7 +10,7 @@ import numpy as np
 from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.labelled import Labelled, Quantity, of_columns, of_energy, of_hand
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.states.snapshots import Snapshots
 from softgrasp.fem.shown import Card, Shown, amount, counted, drawn, listed
 from softgrasp.fem.solve.solvers import SolverUsed
 

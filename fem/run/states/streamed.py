@@ -13,7 +13,7 @@ from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.resources import MARGIN, check_room, reserve_room
 from softgrasp.fem.run.midpoint import TissueState, state_on
-from softgrasp.fem.run.snapshots import NoStore, Snapshots
+from softgrasp.fem.run.states.snapshots import NoStore, Snapshots
 from softgrasp.fem.system import BlockSystem
 
 DAMAGE = (OSError, KeyError, ValueError, TypeError, RuntimeError)  # what h5py raises of files that are not whole

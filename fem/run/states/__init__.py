@@ -1,0 +1,1 @@
+"""States of a run: the trajectory, its snapshots in memory or streamed, times of frames, restart files."""
