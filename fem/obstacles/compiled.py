@@ -47,13 +47,15 @@ int softgrasp_complement(int p, int ld, const double *W, const double *q, double
   int *count, int *order, double *L, double *x, int *side, double *room, long *tally);
 double softgrasp_look(const Flat *f);
 void softgrasp_products(const Swept *s, int j, double *to);
+void softgrasp_combine(const Swept *s, const double *t, double *to);
 void softgrasp_values(const Flat *f, double *to);
 void softgrasp_refresh(const Flat *f);
 double softgrasp_rubbed(const Flat *f);
 int softgrasp_step(Flat *f, int n);
 int softgrasp_finish(Flat *f, int n, const double *v);
-void softgrasp_strike(const Flat *f, int n, double *v);
-int softgrasp_stop(Flat *f, int n, double *v);
+int softgrasp_strike(Flat *f, int n, double *v);
+void softgrasp_jump(const Flat *f, double *v);
+int softgrasp_stop(Flat *f);
 """
 RUB_DECLARATIONS = """
 void softgrasp_matrix(Rub *f);

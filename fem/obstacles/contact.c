@@ -10,27 +10,31 @@ static const double *along(const Flat *f, const int *row) {
 
 /* Gaps at the end of the step into `after` and `least`; the largest coordinate. */
 double softgrasp_look(const Flat *f) {
-  double most = 0, x[3] = {0, 0, 0};
-  for (int o = 0; o < f->obstacles; o++) f->least[o] = INFINITY;
-  for (int i = 0; i < f->p; i++) {
-    for (int a = 0; a < f->d; a++) {
-      int u = i * f->d + a;
-      const double *T = f->T + (size_t)u * f->n_s;
-      if (f->whole) f->moved[u] = f->w[f->at[u]];
-      double rigid = 0;
-      for (int k = 0; k < f->n_s; k++) rigid += T[k] * f->q[k];
-      x[a] = f->X[u] + (f->z[u] + 2 * f->moved[u] + rigid);
-      most = fmax(most, fabs(x[a]));
-    }
-    for (int o = 0; o < f->obstacles; o++) {
-      const double *n = f->along + (size_t)o * (1 + f->m) * f->d;
-      double g = -f->level[o];
-      for (int a = 0; a < f->d; a++) g += n[a] * x[a];
-      f->after[(size_t)o * f->p + i] = g;
-      if (!(g >= f->least[o])) f->least[o] = g; /* so that what is no number is the least */
-    }
+  const int size = f->p * f->d, d = f->d;
+  double most[4] = {0}, *x = f->places;
+  memset(x, 0, size * sizeof(double));
+  for (int k = 0; k < f->n_s; k++) {
+    const double *T = f->modes + (size_t)k * size, q = f->q[k];
+    for (int u = 0; u < size; u++) x[u] += T[u] * q;
   }
-  return most;
+  if (f->whole)
+    for (int u = 0; u < size; u++) f->moved[u] = f->w[f->at[u]];
+  for (int u = 0; u < size; u++) {
+    x[u] = f->X[u] + (f->z[u] + 2 * f->moved[u] + x[u]);
+    if (fabs(x[u]) > most[u % 4]) most[u % 4] = fabs(x[u]);
+  }
+  for (int o = 0; o < f->obstacles; o++) {
+    const double *n = f->along + (size_t)o * (1 + f->m) * d;
+    double *to = f->after + (size_t)o * f->p, least = INFINITY;
+    for (int i = 0; i < f->p; i++) {
+      double g = -f->level[o];
+      for (int a = 0; a < d; a++) g += n[a] * x[i * d + a];
+      to[i] = g;
+      if (!(g >= least)) least = g; /* so that what is no number is the least */
+    }
+    f->least[o] = least;
+  }
+  return fmax(fmax(most[0], most[1]), fmax(most[2], most[3]));
 }
 
 /* Half the gap of a row at the end of the step, or half its slip in the step. */
@@ -283,53 +287,37 @@ int softgrasp_finish(Flat *f, int n, const double *v) {
   return most > f->still;
 }
 
-/* Jump of the velocity under vectors t (4, ways) on `count` columns of M^-1, each axis, or one direction, by itself. */
-static void spread(const Flat *f, int count, const int *column, const double *t, int ways) {
-  const int nodes = f->here / f->d;
-  for (int a = 0; a < ways; a++) {
-    double *u = f->spread + (size_t)a * nodes, s[4];
-    const double *c[4];
-    for (int j = 0; j < 4; j++) {
-      s[j] = j < count ? t[j * ways + a] : 0;
-      c[j] = f->shares + (size_t)(f->ends ? 0 : column[j < count ? j : 0]) * nodes;
-    }
-    if (f->ends)
-      for (int j = 0; j < count; j++)
-        for (int k = f->ends[column[j]]; k < f->ends[column[j] + 1]; k++) u[f->reached_nodes[k]] += s[j] * f->shares[k];
-    else
-      for (int k = 0; k < nodes; k++) u[k] += (s[0] * c[0][k] + s[1] * c[1][k]) + (s[2] * c[2][k] + s[3] * c[3][k]);
-  }
-}
-
-/* Impulses y of the pressed rows at the end of step n: tables, velocities v on the rows here, momentum, hand. */
-void softgrasp_strike(const Flat *f, int n, double *v) {
-  const int d = f->d, m = f->n_s, own = f->feels, nodes = f->here / d;
+/* Impulses y of the pressed rows at the end of step n: tables, momentum, hand, and what is to be solved for the jump of the
+   velocities v on the rows here. Returns the number of axes that it has. */
+int softgrasp_strike(Flat *f, int n, double *v) {
+  const int d = f->d, m = f->n_s, own = f->feels;
   double *impulse = f->impulse + (size_t)n * f->obstacles * d, *force = f->force + (size_t)n * f->obstacles * d;
-  double *kick = f->kick + (size_t)n * m, a[MODES] = {0}, b[MODES] = {0}, wrench[MODES] = {0}, work = 0, t[12] = {0};
-  const double *only = f->along;
-  int ways = 1, count = 0, columns[4], last = -1;
+  double *kick = f->kick + (size_t)n * m, a[MODES] = {0}, b[MODES] = {0}, wrench[MODES] = {0}, work = 0;
+  int last = -1;
+  f->ways = 1;
   for (int j = 0; j < f->k; j++) {
     if (f->y[j] == 0) continue;
-    if (last >= 0 && only != along(f, f->row + 4 * j)) ways = d;
-    only = along(f, f->row + 4 * j);
+    const double *e = along(f, f->row + 4 * j);
+    if (last >= 0 && f->only != e) f->ways = d;
+    f->only = e;
     last = j;
   }
-  memset(f->spread, 0, sizeof(double) * ways * nodes);
+  memset(f->given, 0, sizeof(double) * f->ways * f->nodes);
   for (int j = 0; j <= last; j++) {
     if (f->y[j] == 0) continue;
     const int *row = f->row + 4 * j, o = row[0];
-    const double *e = along(f, row), *S = f->starts + (size_t)f->column[j] * d * m;
+    const double *e = along(f, row), *S = f->starts + (size_t)row[1] * d * m;
     for (int i = 0; own && i < m; i++) b[i] += f->reach[(size_t)j * m + i] * f->y[j];
-    if (!count || columns[count - 1] != f->column[j]) { /* rows of a pair share a column of M^-1: one pass over it */
-      if (count == 4) spread(f, count, columns, t, ways), count = 0, memset(t, 0, sizeof t);
-      columns[count++] = f->column[j];
+    for (int c = 0; c < f->ways; c++) {
+      const double t = f->ways == 1 ? f->y[j] : f->y[j] * e[c];
+      double *to = f->given + (size_t)c * f->nodes;
+      if (!f->mass) to[f->column[j]] += t;
+      else if (t != 0) softgrasp_add(f->mass, f->column[j], t, to);
     }
-    if (ways == 1) t[count - 1] = f->y[j];
     for (int c = 0; c < d; c++) {
       const int u = row[1] * d + c;
       const double y = f->y[j] * e[c];
       impulse[o * d + c] += y;
-      if (ways > 1) t[(count - 1) * d + c] += y;
       force[o * d + c] += y / f->dt;
       work += y * f->v[u];
       for (int i = 0; i < m; i++) {
@@ -337,12 +325,9 @@ void softgrasp_strike(const Flat *f, int n, double *v) {
         kick[i] += S[c * m + i] * y;
       }
     }
-    work += f->y[j] * dot(f->k, f->A + (size_t)j * f->ld, f->y) / 2;
+    work += f->y[j] * (f->m ? dot(f->k, f->A + (size_t)j * f->ld, f->y) : f->b[j]) / 2; /* without friction A y = b */
     add_to_r(f, j, f->s * f->y[j]);
   }
-  spread(f, count, columns, t, ways);
-  for (int c = 0; c < d; c++)
-    for (int k = 0; k < nodes; k++) v[k * d + c] += ways == 1 ? only[c] * f->spread[k] : f->spread[c * nodes + k];
   for (int i = 0; own && i < m; i++) {
     a[i] = dot(m, f->H + i * m, b);
     f->vs[(size_t)(n + 1) * m + i] += a[i];
@@ -357,10 +342,21 @@ void softgrasp_strike(const Flat *f, int n, double *v) {
     if (own) work -= a[i] * (f->pulled[i] + kick[i] / 2);
   }
   f->energy[0] += work;
+  return f->ways;
 }
 
-/* The inelastic impulse at the end of step n. Factor and set of pressed rows are kept. ENTER: rows lack their columns. */
-int softgrasp_stop(Flat *f, int n, double *v) {
+/* Add the jump that was found to the velocities v on the rows here. */
+void softgrasp_jump(const Flat *f, double *v) {
+  const int d = f->d;
+  for (int c = 0; c < d; c++) {
+    const double *u = f->found + (f->ways == 1 ? 0 : (size_t)c * f->nodes), t = f->ways == 1 ? f->only[c] : 1;
+    for (int k = 0; t != 0 && k < f->here / d; k++) v[k * d + c] += t * u[f->place[k]];
+  }
+}
+
+/* The inelastic impulse y at the end of a step. Factor and set of pressed rows are kept; where a pivot of A is small, a
+   ridge makes equal rows share their impulse. ENTER: rows lack their columns. */
+int softgrasp_stop(Flat *f) {
   int count = 0, same = 1;
   double taken = 0, *b = f->room, *y = f->room + f->ld;
   for (int j = 0; j < f->k; j++) {
@@ -370,23 +366,27 @@ int softgrasp_stop(Flat *f, int n, double *v) {
   }
   same = count == f->stopping;
   for (int i = 0; same && i < count; i++) same = f->side[i] == f->stopped[i];
-  for (double ridge = RIDGE; !same; ridge *= 100) {
-    for (f->stopping = 0; f->stopping < count;)
-      if (!append(f->ld, f->A, &f->stopping, f->stopped, f->LA, f->side[f->stopping], ridge)) break;
-    same = f->stopping == count;
+  for (double ridge = 0; !same; ridge = ridge > 0 ? 100 * ridge : RIDGE) {
+    f->ridged = ridge > 0;
+    same = 1;
+    for (f->stopping = 0; same && f->stopping < count;) {
+      const int row = f->side[f->stopping];
+      const size_t at = (size_t)f->stopping * (f->ld + 1);
+      same = append(f->ld, f->A, &f->stopping, f->stopped, f->LA, row, ridge);
+      if (same && !f->ridged) same = f->LA[at] * f->LA[at] > SURE * f->A[(size_t)row * (f->ld + 1)];
+    }
   }
   for (int i = 0; i < count; i++) y[i] = f->b[f->stopped[i]];
   solve(f->ld, count, f->LA, y);
   memset(f->y, 0, f->k * sizeof(double));
   for (int i = 0; i < count; i++) f->y[f->stopped[i]] = y[i];
-  for (int i = 0; i < count; i++) /* without the ridge's error */
+  for (int i = 0; f->ridged && i < count; i++) /* without the ridge's error */
     b[i] = f->b[f->stopped[i]] - dot(f->k, f->A + (size_t)f->stopped[i] * f->ld, f->y);
-  solve(f->ld, count, f->LA, b);
+  if (f->ridged) solve(f->ld, count, f->LA, b);
   for (int i = 0; i < count; i++) {
-    f->y[f->stopped[i]] += b[i];
+    if (f->ridged) f->y[f->stopped[i]] += b[i];
     taken += f->y[f->stopped[i]] * f->b[f->stopped[i]] / 2;
   }
   f->energy[2] += taken;
-  softgrasp_strike(f, n, v);
   return DONE;
 }

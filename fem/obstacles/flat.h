@@ -3,6 +3,7 @@
 
 enum { MODES = 8 }; /* freedoms of a hand, at most */
 enum { DONE, TAKE, ENTER, BALANCE, SOLVE, SWEEP, UNSOLVED, UNSETTLED };
+#define SURE 1e-2 /* pivot over its diagonal above which a solution is within 1e-13 */
 enum { BEGIN, UNTOUCHED, ROWS, FORCES, TAKEN, AFTER };
 
 typedef struct {
@@ -18,6 +19,8 @@ typedef struct {
   double at_rest;           /* rounding of a velocity over the largest */
   int most, most_each;      /* rounds of a step, and of the small problem for each row */
   const double *X, *T;      /* places at rest (p, d), modes of the hand (p d, n_s) */
+  const double *modes;      /* the same modes, one after the other (n_s, p d) */
+  double *places;           /* room for places (p d) */
   const double *along;      /* normals of the half-spaces, each before its tangents (obstacles, 1 + m, d) */
   const int *at;            /* row here of each unknown of the boundary, -1 where another rank has it (p d) */
   const int *rows;          /* the same of the state, where one rank has all (p d) */
@@ -49,15 +52,18 @@ typedef struct {
   double largest;           /* coordinate at the last look */
   double tol, depth, reached; /* tolerance of gaps, depth from which pairs enter, largest gap of pressed rows */
   double fastest, still;    /* largest velocity of a pressed node so far, and what is at rest against it */
-  int struck, stopping;     /* rows with a column of M^-1, and rows of the factor LA */
+  int struck, stopping, ridged; /* rows with a column of M^-1, rows of the factor LA, whether it has a ridge */
   int *stopped;             /* which */
   const double *A;          /* N M^-1 N', with the hand's part (struck, struck) */
   double *LA, *y;           /* factor of A at the stopped rows, impulses (k) */
-  const int *column;        /* column of M^-1 of each row (struck) */
-  const int *ends, *reached_nodes; /* its entries here: where each column begins, their nodes; 0 where all are kept */
-  const double *shares;     /* and values */
-  double *spread;           /* room for a jump of the velocity (here) */
-  const double *starts;     /* G'M^-1 of each column and axis (columns, d, n_s) */
+  const Swept *mass;        /* first sweeps of the mass of one component, or 0 */
+  const int *column;        /* column of each row in them, or else its node (struck) */
+  int nodes, ways;          /* of all ranks; axes that an impulse has, or 1 along one direction */
+  const double *only;       /* that direction */
+  double *given;            /* what is to be solved for each axis: the sums of first sweeps, or the impulses (d, nodes) */
+  const double *found;      /* its solution, the jump of the velocity, in the order of the mass (d, nodes) */
+  const int *place;         /* where the nodes here are in that order (here / d) */
+  const double *starts;     /* M^-1 G on the boundary (p d, n_s) */
   const double *reach, *X_hand; /* N (T - M^-1 G) (struck, n_s), M^-1 G here (n_s, here) */
   const double *H, *GX;     /* (M_hand + M_rigid - G'M^-1 G)^-1, G'M^-1 G (n_s, n_s) */
   double *pulled;           /* G'v before the impulse (n_s) */

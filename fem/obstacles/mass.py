@@ -1,7 +1,9 @@
-"""Columns of M^-1 at the nodes that obstacles stop, for the mass M of one component, M_ee = M x I.
+"""M^-1 for the impulses of obstacles, for the mass M of one component, M_ee = M x I.
 
-A column decays by about a third from node to node, so that only a neighbourhood is reached before rounding; each is
-solved for when an impulse first needs it, and kept.
+With a factor, M^-1 = B F in two sweeps, see :mod:`softgrasp.fem.solve.sweeps`: the first sweep of each node that an
+obstacle stops is kept, which has few entries, and an impulse costs one second sweep. The factor has about a d^2-th of
+the entries of that of a step. Where every rank cannot store one, conjugate gradients solve, which reach a neighbourhood
+of the nodes: a column decays by about a third from node to node.
 """
 
 from __future__ import annotations
@@ -11,45 +13,51 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, csr_matrix
+from scipy.sparse import csr_matrix
+from scipy.sparse.linalg import splu
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.obstacles.compiled import compiled
+from softgrasp.fem.obstacles.lower import DECLARATION, LowerFactor
+from softgrasp.fem.obstacles.responses import TOGETHER
+from softgrasp.fem.obstacles.swept import SweptColumns
 
 Array = NDArray[Any]
 Ints = NDArray[np.intp]
 SOURCE = Path(__file__).with_name("mass.c")
-DECLARATION = """int softgrasp_mass(int n, const int *ptr, const int *col, const double *M, const double *inverse,
-  int most, double rtol, int *order, int count, double *x, double *room, char *in);"""
 MOST = 1000  # rounds; about thirty are usual
+FACTORED = {2: 500_000, 3: 50_000}  # most nodes, by axes, whose mass is factored: 0.2 GB, and 0.6 while it is made
 RTOL = 1e-15  # preconditioned norm of the residual over that of the right-hand side
-DENSE = 0.25  # share of entries above which the columns are kept as an array
 
 
 class NodalMass:
-    """Responses of the velocity to unit impulses on nodes.
+    """Responses of the velocity to impulses on nodes, by conjugate gradients.
 
     Args:
         M: mass of one component, symmetric, positive definite, (nodes, nodes) [kg].
-        here: nodes whose rows are kept, from the first to before the last.
+        d: axes.
         engine: "C" or "NumPy"; empty takes C where there is a compiler.
 
     Attributes:
-        nodes: node of every column.
-        kept: nodes here that M^-1 e of every column reaches, and its values there [1/kg].
-        block: values at the nodes of the columns, (count, count) [1/kg].
+        nodes: nodes with a column of M^-1.
+        where: column of each node, or -1.
+        block: M^-1 at these nodes, (count, count) [1/kg].
+        places: place of each node in ``given`` and ``found``.
+        given: impulses on the nodes of each axis, or sums of first sweeps, (d, nodes).
+        found: what `answer` made of it, M^-1 of the impulses, the same.
     """
 
-    def __init__(self, M: csr_matrix, here: tuple[int, int], engine: str = "") -> None:
-        M.sort_indices()
-        self.M, self.here, n = M, here, M.shape[0]
-        self.inverse = 1 / M.diagonal()
-        self.code = None if engine == "NumPy" else compiled(SOURCE, DECLARATION)
+    def __init__(self, M: csr_matrix, d: int, engine: str = "") -> None:
+        n = M.shape[0]
         self.where = np.full(n, -1)
         self.nodes: Ints = np.zeros(0, dtype=np.intp)
         self.block = np.zeros((0, 0))
-        self.kept: list[tuple[Ints, Array]] = []
-        self._joined: Any = np.zeros((here[1] - here[0], 0))
+        self.places = np.arange(n)
+        self.given: Array = np.zeros((d, n))
+        self.found: Array = np.zeros((d, n))
+        M.sort_indices()
+        self.M, self.inverse = M, 1 / M.diagonal()
+        self.code = None if engine == "NumPy" else compiled(SOURCE, DECLARATION)
         self.order, self.x, self.room, self.marks = np.zeros(n, np.intc), np.zeros(n), np.zeros(3 * n), np.zeros(n, "b")
 
     def enter(self, nodes: Ints) -> None:
@@ -62,29 +70,48 @@ class NodalMass:
         self.nodes = np.concatenate([self.nodes, new])
         block = np.zeros((len(self.nodes),) * 2)
         block[:have, :have] = self.block
-        for j, node in enumerate(new.tolist(), have):
-            order, x = self.solve(np.array([node]), np.ones(1))
-            self.x[order] = x
-            block[j, : j + 1] = block[: j + 1, j] = self.x[self.nodes[: j + 1]]
-            self.x[order] = 0.0
-            mine = (order >= self.here[0]) & (order < self.here[1])
-            self.kept.append((order[mine] - self.here[0], x[mine]))
+        for j, row in enumerate(self._rows(have), have):
+            block[j, : j + 1] = block[: j + 1, j] = row
         self.block = block
 
-    @property
-    def columns(self) -> Any:
-        """M^-1 e of every column on the rows here, (rows here, count) [1/kg]."""
-        shape = self.here[1] - self.here[0], len(self.kept)
-        if self._joined.shape != shape:
-            ends, rows, values = self.entries()
-            columns = csc_matrix((values, rows, ends), shape=shape)
-            self._joined = columns if len(values) < DENSE * shape[0] * shape[1] else columns.toarray(order="F")
-        return self._joined
+    def _rows(self, have: int) -> list[Array]:
+        """Rows of ``block`` up to the diagonal, from ``have`` on."""
+        rows = []
+        for j, node in enumerate(self.nodes[have:].tolist(), have):
+            order, x = self.solve(np.array([node]), np.ones(1))
+            self.x[order] = x
+            rows.append(self.x[self.nodes[: j + 1]])
+            self.x[order] = 0.0
+        return rows
 
-    def entries(self) -> tuple[Ints, Ints, Array]:
-        """Where each column begins, and nodes and values of all that is kept; there must be a column."""
-        rows, values = (np.concatenate(parts) for parts in zip(*self.kept, strict=True))
-        return np.cumsum([0, *(len(each) for each, _ in self.kept)]), rows, values
+    @property
+    def swept(self) -> SweptColumns | None:
+        """First sweeps of the columns, whose sums ``given`` takes; None: it takes the impulses on the nodes."""
+        return None
+
+    def jump(self, impulses: Array) -> Array:
+        """M^-1 of impulses (count, d) on the nodes with columns, as in ``found``."""
+        self.given[:] = 0.0
+        self._sum(impulses)
+        self.answer(len(self.given))
+        return self.found
+
+    def _sum(self, impulses: Array) -> None:
+        """Add impulses (count, d) to ``given``."""
+        self.given[:, self.nodes] += impulses.T
+
+    def answer(self, ways: int) -> None:
+        """Set the first ``ways`` rows of ``found`` from those of ``given``. Raises SolverError: no convergence."""
+        for b, x in zip(self.given[:ways], self.found[:ways], strict=True):
+            x[:] = self.respond(b)
+
+    def respond(self, b: Array) -> Array:
+        """M^-1 b of all nodes, (nodes,). Raises SolverError: no convergence."""
+        x, on = np.zeros(len(b)), np.flatnonzero(b)
+        if len(on):
+            reached, values = self.solve(on, b[on])
+            x[reached] = values
+        return x
 
     def solve(self, nodes: Ints, b: Array) -> tuple[Ints, Array]:
         """Nodes (m,) that M^-1 b reaches, and its values there, for b (k,) at k nodes, zero elsewhere.
@@ -128,6 +155,65 @@ class NodalMass:
             new = float(r @ (self.inverse * r))
             p, rho = self.inverse * r + new / rho * p, new
         raise _unsolved()
+
+
+class SweptMass(NodalMass):
+    """`NodalMass` by a factor, M = L E L' = C C' with ones on the diagonal of L and a diagonal E.
+
+    Args:
+        order: nodes in the order of elimination.
+        code: (ffi, library) of `contact.c`; there must be a compiler.
+
+    Attributes:
+        C: diagonal of C.
+        kept: columns F e = C^-1 e of the nodes with a column of M^-1.
+    """
+
+    def __init__(self, M: csr_matrix, d: int, order: Ints, code: Any) -> None:
+        super().__init__(M, d)
+        lu = splu(
+            M[order][:, order].tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+        self.places[order], self.C = lu.perm_c, np.sqrt(lu.U.diagonal())
+        self.L, self.kept = LowerFactor(lu.L, self.code), SweptColumns(np.ones((len(order), 1, 1)), code)
+
+    @property
+    def swept(self) -> SweptColumns | None:
+        """See :attr:`NodalMass.swept`."""
+        return self.kept
+
+    def _rows(self, have: int) -> list[Array]:
+        """See :meth:`NodalMass._rows`."""
+        rows = []
+        for first in range(have, len(self.nodes), TOGETHER):
+            places = self.places[self.nodes[first : first + TOGETHER]]
+            columns = np.zeros((len(self.C), len(places)), order="F")
+            for column, place in zip(columns.T, places.tolist(), strict=True):
+                column[place] = 1.0
+                self.L.ahead(column)
+            self.kept.append(columns / self.C[:, None])
+            rows += [self.kept.products(first + j) for j in range(len(places))]
+        return rows
+
+    def _sum(self, impulses: Array) -> None:
+        """See :meth:`NodalMass._sum`."""
+        for t, to in zip(np.ascontiguousarray(impulses.T), self.given, strict=True):
+            self.kept.combine(t, to)
+
+    def answer(self, ways: int) -> None:
+        """See :meth:`NodalMass.answer`."""
+        for y, x in zip(self.given[:ways], self.found[:ways], strict=True):
+            np.divide(y, self.C, out=x)
+            self.L.back(x)
+
+    def respond(self, b: Array) -> Array:
+        """See :meth:`NodalMass.respond`."""
+        x = np.zeros(len(b))
+        x[self.places] = b
+        self.L.ahead(x)
+        x /= self.C**2
+        self.L.back(x)
+        return x[self.places]
 
 
 def _unsolved() -> SolverError:

@@ -26,9 +26,10 @@ class Responses:
 
     Args:
         directions: unit vectors, (m, d).
-        respond: responses to forces (p d, k) on the boundary: on the rows here, and on it (p d, k). Collective.
+        respond: responses on the rows here to forces (p d, k) on the boundary, (rows here, k). Collective.
         reach: T - theta S^-1 G on the boundary of a two-way hand, (p d, n_s), and its L^-1 / s^2; None where the hand
             feels no tissue.
+        take: values on the boundary (p d,) of a response. Collective.
 
     Attributes:
         keys: boundary node and direction of every column, by their numbers, (capacity, 2), the first ``count`` of them.
@@ -43,11 +44,12 @@ class Responses:
     def __init__(
         self,
         directions: Array,
-        respond: Callable[[Array], tuple[Array, Array]],
+        respond: Callable[[Array], Array],
         size: int,
         reach: tuple[Array, Array] | None = None,
+        take: Callable[[Array], Array] | None = None,
     ) -> None:
-        self.directions, self.respond, self.size, self.reach = directions, respond, size, reach
+        self.directions, self.respond, self.size, self.reach, self.take = directions, respond, size, reach, take
         self.d = directions.shape[1]
         self.keys = np.zeros((0, 2), dtype=int)
         self.where: dict[Key, int] = {}
@@ -90,12 +92,14 @@ class Responses:
 
     def _solve(self, first: int, forces: Array) -> None:
         """The columns from ``first`` on, of forces (p d, k). Collective."""
-        columns, there = self.respond(forces)
+        columns = self.respond(forces)
+        assert self.take is not None
         new = slice(first, first + forces.shape[1])
         if self.columns.shape[1] < len(self.G):
             self.columns = larger(self.columns, (len(columns), len(self.G)), "F")
             self.surface = larger(self.surface, (self.size, len(self.G)), "F")
-        self.columns[:, new], self.surface[:, new] = columns, there
+        self.columns[:, new] = columns
+        self.surface[:, new] = np.column_stack([self.take(column) for column in columns.T])
 
     def _relate(self, j: int) -> None:
         """Products of column j with those before it."""

@@ -1,5 +1,5 @@
 /* Rows n'w = (F n)'D y of the second sweep w = B y of a solve before it, and forces into y: S^-1 = B F, see sweeps.py.
-   F n is in runs of consecutive entries. */
+   F n is in runs of consecutive entries. The mass of one component has such columns too, with blocks of one entry. */
 #pragma once
 #include "dense.h"
 
@@ -7,20 +7,19 @@ typedef struct {
   int d, columns;       /* rows of a node; columns F n */
   const int *first;     /* run with which each column begins (columns + 1) */
   const int *runs;      /* entry with which each run begins, and its length (.., 2) */
-  const long *at;       /* value with which each column begins (columns) */
+  const long *at;       /* value with which each column begins (columns + 1) */
   const double *values;
   int reached;          /* nodes on which a column has entries */
   const int *nodes;     /* which (reached) */
-  const double *D;      /* and their blocks (reached, d, d) */
+  const double *D;      /* blocks of all nodes (.., d, d) */
   double *y, *z;        /* first sweep, and room that is zero elsewhere (n) */
 } Swept;
 
 /* z = D x. */
 static void softgrasp_scale(const Swept *s, const double *from) {
   const int d = s->d;
-  const double *D = s->D;
-  for (int i = 0; i < s->reached; i++, D += d * d) {
-    const double *x = from + (size_t)s->nodes[i] * d;
+  for (int i = 0; i < s->reached; i++) {
+    const double *x = from + (size_t)s->nodes[i] * d, *D = s->D + (size_t)s->nodes[i] * d * d;
     double *z = s->z + (size_t)s->nodes[i] * d, t[3] = {0, 0, 0};
     for (int a = 0; a < d; a++)
       for (int b = 0; b < d; b++) t[a] += D[a * d + b] * x[b];
@@ -47,6 +46,12 @@ static void softgrasp_add(const Swept *s, int k, double t, double *to) {
     for (int j = 0; j < s->runs[2 * i + 1]; j++) y[j] += t * v[j];
     v += s->runs[2 * i + 1];
   }
+}
+
+/* Add columns t. */
+void softgrasp_combine(const Swept *s, const double *t, double *to) {
+  for (int k = 0; k < s->columns; k++)
+    if (t[k] != 0) softgrasp_add(s, k, t[k], to);
 }
 
 /* Products of column j with those up to it. */

@@ -14,18 +14,24 @@ import numpy as np
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.surface import Surface, make_surface, node_distance
 from softgrasp.fem.obstacles import HalfSpace, Obstacle, make_obstacles
+from softgrasp.fem.obstacles.mass import FACTORED
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import motion_table
 from softgrasp.fem.run.states.snapshots import spread
 from softgrasp.fem.solve.costs import SolverName
 
 INSTANTS = 200  # of a prescribed motion, at which gaps are computed
-REACHED = {2: 4000, 3: 40_000}  # nodes that a column of M^-1 reaches before rounding, by dimension [1]
-MASS = {2: 2e-7, 3: 7e-7}  # time of such a column, by dimension [s a node that it reaches]
+# Entries of the factor of the mass with n nodes: 2.5 n log2 n in 2D, 6.5 n^(4/3) in 3D; 2.3 and 2.5 were counted for
+# 27 000 and 104 000 nodes, 5.4 to 7.6 for 1200 to 8800 [1].
+FILL = {2: 2.5, 3: 6.5}
+MASS = 1e-7  # time of such an entry while it is made [s]
+MASS_BYTES = 20.0  # of such an entry; while it is made, both factors and one copy are there [byte]
 # Ancestors of a node in nested dissection over the nodes of a cut, (nodes)^(1 - 1/d): 2.1 to 2.8 and 1.9 to 2.2 were
 # counted for nodes of the lower edge or face, with 400 to 20 200 and 441 to 6615 nodes [1].
 ANCESTORS = {2: 2.7, 3: 2.1}
-SQUARES = 5  # matrices over the rows, W = N S^-1 N', its factor, those of impulses, and room for twice the rows
+# Matrices over the rows: N S^-1 N' twice, its factor, N M^-1 N' and its factor; with friction both inverses too, all
+# four in single precision, and a factor of each problem of odd and of even steps [byte an entry].
+SQUARES = {False: 40.0, True: 88.0}
 
 
 @dataclass(frozen=True)
@@ -37,13 +43,13 @@ class ExpectedContact:
     surface: int  # unknowns of the boundary [1]
     dimension: int  # axes [1]
     flat: bool  # whether there are half-spaces alone
+    rubs: bool  # whether an obstacle has friction
 
     def memory(self, n: int, ranks: int, copies: float, solver: SolverName) -> float:
         """Memory over all ranks [byte] with n unknowns, of which ``copies`` are kept."""
         rows = ranks * self._ancestors(n) if self._swept(solver) else copies * n + ranks * self.surface
-        return 8.0 * self.columns * rows + ranks * (
-            24.0 * self.nodes * self._reached(n) + SQUARES * 8.0 * (2 * self.columns) ** 2
-        )
+        mass = 8.0 * self.nodes * self._ancestors(n) / self.dimension + MASS_BYTES * self._fill(n)
+        return 8.0 * self.columns * rows + ranks * (mass + SQUARES[self.rubs] * self.columns**2)
 
     def seconds(self, n: int, solve: float, steps: int, factor: float, solver: SolverName) -> float:
         """Time of first touches and of all steps in contact [s], at most; solve: time of one with ``factor`` bytes [s].
@@ -54,7 +60,7 @@ class ExpectedContact:
         read = 2 * self._ancestors(n) if swept else n
         step = solve * min(1.0, 8.0 * self.columns * read / max(2 * factor, 1.0))
         touches = self.columns * solve * (0.5 if swept else 1.0)
-        return touches + self.nodes * self._reached(n) * MASS[self.dimension] + steps * step
+        return touches + self._fill(n) * MASS + steps * step
 
     def _swept(self, solver: SolverName) -> bool:
         return self.flat and solver == "cholesky"
@@ -63,8 +69,12 @@ class ExpectedContact:
         d = self.dimension
         return min(n, ANCESTORS[d] * d * math.pow(n / d, 1 - 1 / d))
 
-    def _reached(self, n: int) -> int:
-        return min(n // self.dimension, REACHED[self.dimension])
+    def _fill(self, n: int) -> float:
+        """Entries of the factor of the mass; none where conjugate gradients solve."""
+        nodes, fill = n / self.dimension, FILL[self.dimension]
+        if nodes > FACTORED[self.dimension]:
+            return 0.0
+        return fill * nodes * (math.log2(nodes + 1) if self.dimension == 2 else math.cbrt(nodes))
 
 
 def expected_contact(model: Model, n: int | None = None) -> ExpectedContact | None:
@@ -88,7 +98,8 @@ def expected_contact(model: Model, n: int | None = None) -> ExpectedContact | No
     columns = int(touching.sum(axis=1) @ np.where(straight, 1, d))
     nodes = int(touching.any(axis=0).sum())
     flat = all(isinstance(o.shape, HalfSpace) for o in obstacles)
-    return ExpectedContact(round(finer * nodes), round(finer * columns), round(finer * surface.X.size), d, flat)
+    nodes, columns, size = (round(finer * count) for count in (nodes, columns, surface.X.size))
+    return ExpectedContact(nodes, columns, size, d, flat, any(e.friction for e in entries))
 
 
 def nearest_gaps(

@@ -19,7 +19,7 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles import HalfSpace
 from softgrasp.fem.obstacles.compiled import BALANCE, DONE, ENTER, KINDS, SOLVE, SWEEP, TAKE, UNSETTLED, contact_library
 from softgrasp.fem.obstacles.responses import Responses
-from softgrasp.fem.obstacles.swept import SweptResponses
+from softgrasp.fem.obstacles.swept import SweptColumns, SweptResponses
 from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.run.contact.general import MOST, ROUNDING, STILL, Contact, unsettled
 from softgrasp.fem.run.contact.rows import Ints, Rows
@@ -67,16 +67,16 @@ class FlatContact(Contact):
         self.sweeps = sweeps_of(solver, self.d) if self.whole and self.surface.B is None else None
         if self.sweeps is None:
             return made
-        code, D = (self.ffi, self.c), self.sweeps.D
-        swept = SweptResponses(made.directions, self._respond_ahead, made.size, made.reach, D, code)
+        columns = SweptColumns(self.sweeps.D, (self.ffi, self.c))
+        swept = SweptResponses(made.directions, self._respond_ahead, made.size, made.reach, columns)
         self.swept = PETSc.Vec().createWithArray(swept.y, comm=PETSc.COMM_SELF)
         return swept
 
-    def _respond_ahead(self, forces: Array) -> tuple[Array, Array]:
+    def _respond_ahead(self, forces: Array) -> Array:
         """F of forces (p d, k) on the boundary."""
         b = np.zeros((len(self.b.array_r), forces.shape[1]), order="F")
         b[self.places] = forces[self.order]
-        return self._ahead(b), b[:0]
+        return self._ahead(b)
 
     def _ahead(self, b: Array) -> Array:
         """F b of columns (n, k)."""
@@ -112,6 +112,7 @@ class FlatContact(Contact):
         rows = self.surface.rows.astype(np.intc) if self.alone else np.zeros(0, np.intc)
         self.point(
             X=self.surface.X, T=np.ascontiguousarray(self.surface.T), along=self.along, at=at, rows=rows,
+            modes=np.ascontiguousarray(self.surface.T.T), places=np.zeros(size),
             w=m.w_array, r=m.r_array, z=self.z, moved=self.moved, v=self.v, q=self.q,
             slide=self.slide, level=self.level, rate=self.rate, gap=self.gaps, after=self.after,
             entered=self.entered, least=self.least, force=table.force, impulse=table.impulse, touching=table.touching,
@@ -237,7 +238,7 @@ class FlatContact(Contact):
         if not isinstance(self.responses, SweptResponses):
             self.point(columns=self.responses.columns.T)
         elif not self.f.swept:
-            self.f.swept = self.responses.f
+            self.f.swept = self.responses.swept.f
             if self.hand is not None:
                 self.point(Y=np.ascontiguousarray(self._ahead(self.midpoint.G).T))
         every = self.row[:, 2]
@@ -294,15 +295,22 @@ class FlatContact(Contact):
     def _halt_flat(self, state: TissueState, v: Any) -> None:
         """The impulse on pressed rows, one of which moves; v: pointer to the velocities here. Collective."""
         if self.surface.B is None:
-            if self.c.softgrasp_stop(self.f, self.n, v) == ENTER:
+            if self.c.softgrasp_stop(self.f) == ENTER:
                 self.stops.enter()
-                self.c.softgrasp_stop(self.f, self.n, v)
-            state.v.stateIncrease()
+                self.c.softgrasp_stop(self.f)
+            self._strike_flat(state, v)
             return
         rows = self._pressed_rows()
         assert self.drive is not None
         b = self.rates[: len(self.row)][self.x[: len(self.row)] > 0]
         self.strike.stop(state, self.drive, self.n + 1, rows.obstacle, rows.node, rows.normal, b)
+
+    def _strike_flat(self, state: TissueState, v: Any) -> None:
+        """The impulses that are in y at the end of the step. Collective."""
+        ways = self.c.softgrasp_strike(self.f, self.n, v)
+        self.stops.mass.answer(ways)
+        self.c.softgrasp_jump(self.f, v)
+        state.v.stateIncrease()
 
     def _pressed_rows(self) -> Rows:
         on = np.flatnonzero(self.x[: len(self.row)] > 0)

@@ -300,8 +300,7 @@ class FlatFriction(FlatContact):
             y, on = np.linalg.solve(self.stops.A[np.ix_(first, first)], self.rates[first]), first
             self.table.energy[2] += y @ self.rates[first] / 2
         self.struck[on] = y
-        self.c.softgrasp_strike(self.f, self.n, v)
-        state.v.stateIncrease()
+        self._strike_flat(state, v)
 
     def _sets(self) -> list[NDArray[Any]]:
         """See :meth:`Contact._sets`."""

@@ -104,19 +104,18 @@ class Contact:
         if self.hand is not None:
             self.Y = np.column_stack([self._take(column) for column in self.midpoint.Y.T])
             reach = self.surface.T - self.hand.theta * self.Y, self.hand.inverse / self.s**2
-        return Responses(directions, self._respond, self.p * self.d, reach)
+        return Responses(directions, self._respond, self.p * self.d, reach, self._take)
 
     def _basis(self, obstacle: Obstacle) -> Array:
         """Directions in which the nodes that an obstacle presses have responses, (m, d)."""
         return obstacle.shape.normal[None] if isinstance(obstacle.shape, HalfSpace) else np.eye(self.d)
 
-    def _respond(self, forces: Array) -> tuple[Array, Array]:
+    def _respond(self, forces: Array) -> Array:
         """S^-1 of forces (p d, k) on the boundary. Collective."""
         b = np.zeros((len(self.b.array_r), forces.shape[1]), order="F")
         for j, force in enumerate(forces.T):
             b[self.places, j] = self.surface.on_nodes(force)[self.order]
-        columns = self.midpoint.solver.columns(b, room=(self.b, self.y))
-        return columns, np.column_stack([self._take(column) for column in columns.T])
+        return self.midpoint.solver.columns(b, room=(self.b, self.y))
 
     def _take(self, x: Array) -> Array:
         """Values on the boundary of a vector on the rows here. Collective."""

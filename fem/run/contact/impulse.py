@@ -4,7 +4,8 @@ With X = M^-1 G of a hand that feels the tissue, H = M_hand + M_rigid - G'X and 
 
     A = N M^-1 N' + B H^-1 B',   u = M^-1 N'y - X a,   a = H^-1 B'y.
 
-M is the same for every component, so that a node costs one column of its inverse for all directions.
+M is the same for every component, so that a node costs one column of its inverse for all directions, see
+:mod:`softgrasp.fem.obstacles.mass`.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from softgrasp.fem.model.surface import Surface
-from softgrasp.fem.obstacles.compiled import RIDGE
-from softgrasp.fem.obstacles.mass import NodalMass
+from softgrasp.fem.obstacles.compiled import RIDGE, contact_library
+from softgrasp.fem.obstacles.mass import FACTORED, NodalMass, SweptMass
 from softgrasp.fem.obstacles.small import SHARES
-from softgrasp.fem.petsc import Array, to_scipy, whole_copy
+from softgrasp.fem.petsc import Array, rows_on_all, to_scipy, total, whole_copy
+from softgrasp.fem.solve.cholesky import nested_dissection
 from softgrasp.fem.system import BlockSystem
 
 Ints = NDArray[np.intp]
@@ -30,6 +32,9 @@ class Impulses:
         system: of the run.
         surface: its boundary.
         free: whether the hand feels them.
+
+    Attributes:
+        starts: M^-1 G on the boundary, (p d, n_s).
     """
 
     def __init__(self, system: BlockSystem, surface: Surface, free: bool) -> None:
@@ -39,31 +44,30 @@ class Impulses:
         one = to_scipy(M)[::d, ::d].tocsr()
         if M is not system.M_ee:
             M.destroy()
-        first = layout.start // d
-        self.mass = NodalMass(one, (first, first + layout.n_local // d))
-        self.n, self.n_s = layout.n_local, layout.n_s if free else 0
+        if one.shape[0] > FACTORED[d] or (code := contact_library()) is None:
+            self.mass = NodalMass(one, d)
+        else:
+            self.mass = SweptMass(one, d, nested_dissection(one.indptr, one.indices), code)
+        first, self.n, self.n_s = layout.start // d, layout.n_local, layout.n_s if free else 0
+        self.places = self.mass.places[first : first + self.n // d]  # of the nodes here in a jump
         self.X, self.H = np.zeros((layout.n_local, 0)), np.zeros((0, 0))
         self.reach, self.G = np.zeros((surface.X.size, 0)), system.G
-        if free:
-            self._couple(system)
+        self._couple(system, free)
         self.key, self.A, self.factor = b"", np.zeros((0, 0)), (np.zeros((0, 0)), True)
 
-    def _couple(self, system: BlockSystem) -> None:
+    def _couple(self, system: BlockSystem, free: bool) -> None:
         """Responses to the hand. Collective."""
-        from softgrasp.fem.petsc import rows_on_all, total  # few scenes need it
-
-        comm, d = system.layout.comm, self.d
-        G = rows_on_all(comm, system.G)
-        X = np.zeros_like(G)
-        every = np.arange(len(G) // d)
-        for j in range(G.shape[1]):
+        comm, d, X = system.layout.comm, self.d, rows_on_all(system.layout.comm, system.G)
+        for column in X.T:
             for axis in range(d):
-                nodes, values = self.mass.solve(every, np.ascontiguousarray(G[axis::d, j]))
-                X[nodes * d + axis, j] = values
+                column[axis::d] = self.mass.respond(column[axis::d].copy())
+        self.starts = np.column_stack([self.surface.at_points(x) for x in X[self.surface.dofs].T])
+        if not free:
+            return
         first = system.layout.start
         self.X = X[first : first + self.n]
         self.H = system.M_hand + system.M_rigid - total(comm, system.G.T @ self.X)
-        self.reach = self.surface.T - np.column_stack([self.surface.at_points(x) for x in X[self.surface.dofs].T])
+        self.reach = self.surface.T - self.starts
 
     def matrix(self, nodes: Ints, directions: Array) -> Array:
         """A (k, k) [1/kg] of unit impulses on boundary nodes (k,) along unit vectors (k, d); kept for the same ones.
@@ -112,9 +116,9 @@ class Impulses:
         For impulses y (k,) [N s] on the nodes and directions of the last `matrix`.
         """
         each, (at, shares) = y[:, None] * directions, self._at(nodes)
-        total = np.zeros((len(self.mass.nodes), self.d))
-        np.add.at(total, at, each if shares is None else shares.T @ each)
-        u, gained = (self.mass.columns @ total).ravel(), np.zeros(self.n)
+        on_columns = np.zeros((len(self.mass.nodes), self.d))
+        np.add.at(on_columns, at, each if shares is None else shares.T @ each)
+        u, gained = self.mass.jump(on_columns)[:, self.places].T.ravel(), np.zeros(self.n)
         forces = np.zeros(self.surface.X.shape)
         np.add.at(forces, nodes, each)
         gained[self.surface.rows] = self.surface.on_nodes(forces.ravel())[self.surface.mine]

@@ -34,13 +34,12 @@ def resting(contact: Contact, q: Array, time: Time) -> Array:
     free = equilibrium(system, name, time)
     with factored_stiffness(system, name, reproducible=time.reproducible) as factor:
 
-        def respond(forces: Array) -> tuple[Array, Array]:
+        def respond(forces: Array) -> Array:
             b = np.zeros((layout.n_local, forces.shape[1]))
             b[surface.rows] = np.column_stack([surface.on_nodes(force) for force in forces.T])[surface.mine]
-            columns = factor.columns(b, "the response to an obstacle")
-            return columns, np.column_stack([surface.gather(column) for column in columns.T])
+            return factor.columns(b, "the response to an obstacle")
 
-        responses = Responses(contact.responses.directions, respond, contact.p * contact.d)
+        responses = Responses(contact.responses.directions, respond, contact.p * contact.d, take=surface.gather)
         return free + _forces(contact, responses, q, surface.gather(free))
 
 

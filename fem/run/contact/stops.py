@@ -1,4 +1,4 @@
-"""Impulses before half-spaces: what `contact.c` needs of the inverse mass for the rows that ever touched."""
+"""Impulses before half-spaces: what `contact.c` needs of M^-1 for the rows that ever touched."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.model.surface import Surface
+from softgrasp.fem.obstacles.mass import NodalMass
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.contact.strike import Strike
 from softgrasp.fem.system import BlockSystem
@@ -50,7 +51,12 @@ class Stops:
     """
 
     def __init__(self, contact: Stopped) -> None:
-        self.contact, self.A, self.reach, self.starts = contact, np.zeros((0, 0)), np.zeros((0, 0)), list[Array]()
+        self.contact, self.A, self.reach = contact, np.zeros((0, 0)), np.zeros((0, 0))
+
+    @property
+    def mass(self) -> NodalMass:
+        """M^-1 of one component."""
+        return self.contact.strike.reactions().mass
 
     def grow(self, size: int) -> None:
         """Room for rows, beside those there; none before the first impulse."""
@@ -92,30 +98,22 @@ class Stops:
         both[:] = np.triu(both) + np.triu(both, 1).T
         self.A[:count, new], self.A[new, :count] = more, more.T
         f.struck = count
-        contact.point(column=at.astype(np.intc), starts=self._starts())
-        if isinstance(columns := mass.columns, np.ndarray):
-            f.ends = contact.ffi.NULL
-            contact.point(shares=columns.T)
-        else:
-            contact.point(ends=columns.indptr, reached_nodes=columns.indices, shares=columns.data)
+        contact.point(column=(at if mass.swept else mass.nodes[at]).astype(np.intc))
 
     def _begin(self) -> None:
         """Room for all rows, and what impulses do to the hand. Collective."""
         contact, impulses = self.contact, self.contact.strike.reactions()
         self.A, self.reach = np.zeros((1, 1)), np.zeros((1, contact.f.n_s))
         self.grow(len(contact.W))
-        contact.point(spread=np.zeros(contact.f.here))
-        if contact.f.feels:
+        f, mass = contact.f, impulses.mass
+        f.nodes = mass.given.shape[1]
+        f.mass = mass.swept.f if mass.swept else contact.ffi.NULL
+        contact.point(
+            given=mass.given, found=mass.found, place=impulses.places.astype(np.intc),
+            starts=np.ascontiguousarray(impulses.starts),
+        )  # fmt: skip
+        if f.feels:
             contact.point(
                 X_hand=np.ascontiguousarray(impulses.X.T), H=np.ascontiguousarray(np.linalg.inv(impulses.H)),
                 GX=np.ascontiguousarray(total(contact.layout.comm, contact.system.G.T @ impulses.X)),
             )  # fmt: skip
-
-    def _starts(self) -> Array:
-        """G'M^-1 of every column and axis, (columns, d, n_s). Collective."""
-        contact, mass = self.contact, self.contact.strike.reactions().mass
-        G = contact.system.G.reshape(-1, contact.d, contact.f.n_s)
-        new = [np.einsum("i,iak->ak", values, G[nodes]) for nodes, values in mass.kept[len(self.starts) :]]
-        if new:
-            self.starts += list(total(contact.layout.comm, np.array(new)))
-        return np.array(self.starts)

@@ -1,0 +1,91 @@
+"""Solves with the factor of a sparse matrix, compiled, in blocks of neighbouring columns that share their rows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_matrix, tril
+
+Array = NDArray[Any]
+DECLARATION = """
+typedef struct {
+  int count;
+  const int *begin, *first, *rows;
+  const long *at;
+  const double *values;
+  double *room;
+} Lower;
+int softgrasp_mass(int n, const int *ptr, const int *col, const double *M, const double *inverse, int most, double rtol,
+  int *order, int count, double *x, double *room, char *in);
+void softgrasp_ahead(const Lower *L, double *x);
+void softgrasp_back(const Lower *L, double *x);
+"""
+GROUP = 4
+WASTE = 16
+
+
+class LowerFactor:
+    """L with ones on its diagonal, as elimination leaves it: rows of a column below the next one are rows of that too.
+
+    Args:
+        L: factor, (n, n).
+        code: (ffi, library) of `mass.c`.
+    """
+
+    def __init__(self, L: csc_matrix, code: Any) -> None:
+        (self.ffi, self.c), below = code, tril(L, -1, format="csc")
+        below.sort_indices()
+        ptr, rows, n = below.indptr, below.indices, L.shape[0]
+        begin = _blocks(ptr, rows)
+        sizes = np.diff(begin)
+        last = begin[1:] - 1  # column of each block, whose rows are those of the block
+        count = np.diff(ptr)[last]
+        first = np.concatenate([[0], np.cumsum(count)])
+        of_last = np.repeat(ptr[last] - first[:-1], count) + np.arange(first[-1])
+        beneath, block = rows[of_last], np.repeat(np.arange(len(sizes)), sizes)
+        width, height = -(-sizes // GROUP) * GROUP, -(-count // GROUP) * GROUP
+        ends = np.cumsum(sizes * (width + height))
+        at = ends - sizes * (width + height)
+        column = np.repeat(np.arange(n), np.diff(ptr))
+        of = block[column]
+        inside = rows < begin[of + 1]
+        keys = np.repeat(np.arange(len(sizes)), count) * n + beneath
+        place = np.searchsorted(keys, of * n + rows) - first[of] + width[of]
+        place = np.where(inside, rows - begin[of], place)
+        values = np.zeros(int(ends[-1]))
+        values[at[of] + (column - begin[of]) * (width + height)[of] + place] = below.data
+        self.f, self.f.count = self.ffi.new("Lower *"), len(sizes)
+        self.arrays = {
+            "begin": begin.astype(np.intc), "first": first.astype(np.intc), "rows": beneath.astype(np.intc),
+            "at": at.astype(np.int64), "values": values, "room": np.zeros(int(height.max())),
+        }  # fmt: skip
+        for name, array in self.arrays.items():
+            kind = {"i": "int[]", "l": "long[]", "d": "double[]"}[array.dtype.char]
+            setattr(self.f, name, self.ffi.from_buffer(kind, array))
+
+    def ahead(self, x: Array) -> None:
+        """L^-1 x in place, (n,)."""
+        self.c.softgrasp_ahead(self.f, self.ffi.from_buffer("double[]", x))
+
+    def back(self, x: Array) -> None:
+        """L^-T x in place, (n,)."""
+        self.c.softgrasp_back(self.f, self.ffi.from_buffer("double[]", x))
+
+
+def _blocks(ptr: Array, rows: Array) -> Array:
+    """Columns with which blocks begin, and n: a column joins the next one where that is its first row below."""
+    n, length = len(ptr) - 1, np.diff(ptr).tolist()
+    follows = np.zeros(n, dtype=bool)
+    some = np.flatnonzero(np.diff(ptr))
+    follows[some] = rows[ptr[some]] == some + 1
+    joins, full = follows.tolist(), 0
+    begin = [n]
+    for k in range(n - 1, -1, -1):
+        full += 1  # rows of column k as one of the block
+        if k == n - 1 or not joins[k] or full > length[k] + WASTE:
+            if k < n - 1:
+                begin.append(k + 1)
+            full = length[k]
+    return np.array([*begin, 0])[::-1]
