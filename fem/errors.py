@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # scenes are read without MPI
 
 SPIN = 1e-3  # time that a rank waits awake before it sleeps [s]
 NAP = 0.02  # longest sleep between two looks at the other ranks [s]
+SHARE = 0.1  # of the time waited so far that a sleep takes, so that a rank is late by a tenth of its wait at most
 LONGEST = 590  # letters of the longest sentence, some lines of a terminal [1]
 
 
@@ -84,11 +85,11 @@ def meet(comm: MPI.Intracomm) -> None:
     """Barrier that sleeps after a while, since a rank that spins occupies a core that others need. Collective."""
     if comm.size == 1:
         return
-    everyone, begin, nap = comm.Ibarrier(), time.monotonic(), 0.0
+    everyone, begin = comm.Ibarrier(), time.monotonic()
     while not everyone.Test():
-        if time.monotonic() - begin > SPIN:
-            nap = min(nap + NAP / 20, NAP)
-            time.sleep(nap)
+        waited = time.monotonic() - begin
+        if waited > SPIN:
+            time.sleep(min(SHARE * waited, NAP))
 
 
 @contextmanager

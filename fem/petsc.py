@@ -15,6 +15,7 @@ from petsc4py import PETSc as PETSc
 
 from softgrasp.fem import _stack as _stack
 from softgrasp.fem.errors import meet
+from softgrasp.fem.rows import DistributedRows
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -22,6 +23,8 @@ SAME = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
 FEW_COLUMNS = 2  # up to so many columns setting up a product of matrices needs more time than it saves
 BLOCK_COLUMNS = 8  # least number of columns of a block
 FEW_ENTRIES = 524_288  # up to so many entries of eight columns and more SciPy's product is the faster one
+MANY_COLUMNS = 12  # from so many on the product with a copy of the local rows is the faster one on several ranks
+COPIED_ENTRIES = 16_777_216  # of a matrix, for each rank, of which products on several ranks keep a copy (200 MB)
 BLOCK_ENTRIES = 131_072  # approximate number of entries of a block, whose memory the C library keeps for reuse
 
 
@@ -114,14 +117,17 @@ def times_columns(A: PETSc.Mat, X: Array) -> Array:
     """A X for local rows of dense columns, (n_local, k), in the storage of the faster way. Collective.
 
     On one rank X stored by rows, or of eight columns and more with few entries, goes by SciPy's product, for which the
-    matrix keeps a copy, and other X by PETSc's in blocks; on more ranks all columns go at once, since every block needs
-    messages. One or two columns, and a rank without rows, on which PETSc's product crashes, go by the product with
-    vectors. Times of the ways: docs/benchmarks.md.
+    matrix keeps a copy, and other X by PETSc's in blocks. On more ranks X of :data:`MANY_COLUMNS` goes by SciPy's
+    product with a copy of the local rows, where they have at most :data:`COPIED_ENTRIES`, other X by PETSc's. One or
+    two columns go by the product with vectors, as do all where a rank has no rows, on which PETSc's product crashes.
+    Times of the ways: docs/benchmarks.md.
     """
     k, serial, entries = X.shape[1], A.comm.size == 1, A.getType() != PETSc.Mat.Type.PYTHON
     few = k >= BLOCK_COLUMNS and X.size <= FEW_ENTRIES
     if serial and entries and k > 1 and (few or not X.flags.f_contiguous):
-        return np.asarray(_kept_rows(A) @ X)
+        return np.asarray(_kept(A, to_scipy) @ X)
+    if not serial and entries and k >= MANY_COLUMNS and (rows := _kept(A, _distributed_rows)) is not None:
+        return rows.times(X)
     result = np.empty((A.getLocalSize()[0], k), order="F")
     if entries and k > FEW_COLUMNS and np.diff(A.getOwnershipRanges()).min() > 0:
         _by_blocks(A, X, result, max(1, min(X.size // BLOCK_ENTRIES, k // BLOCK_COLUMNS)) if serial else 1)
@@ -130,13 +136,19 @@ def times_columns(A: PETSc.Mat, X: Array) -> Array:
     return result
 
 
-def _kept_rows(A: PETSc.Mat) -> Any:
-    """A matrix of one rank as SciPy's CSR, kept with it until its entries change."""
+def _kept[Rows](A: PETSc.Mat, make: Callable[[PETSc.Mat], Rows]) -> Rows:
+    """What serves products with a matrix, kept with it until its entries change. Collective."""
     kept: Any = A.getAttr("rows")
     if kept is None or kept[0] != A.stateGet():
-        kept = (A.stateGet(), to_scipy(A))
+        kept = (A.stateGet(), make(A))
         A.setAttr("rows", kept)
-    return kept[1]
+    rows: Rows = kept[1]
+    return rows
+
+
+def _distributed_rows(A: PETSc.Mat) -> DistributedRows | None:
+    """Rows for products on several ranks; None where a copy of them needs too much memory. Collective."""
+    return DistributedRows(A) if A.getInfo()["nz_used"] <= COPIED_ENTRIES * A.comm.size else None
 
 
 def _by_vectors(A: PETSc.Mat, X: Array, result: Array) -> None:

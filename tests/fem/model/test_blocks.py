@@ -55,9 +55,10 @@ def test_the_paper_has_these_sizes(comm: MPI.Intracomm, cells: list[int], states
 def test_products_with_columns_equal_scipy(
     comm: MPI.Intracomm, columns: int, storage: Any, entries: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By vectors, in one block, in two, and by SciPy; also after the matrix changed."""
+    """By vectors, in one block, in two, by SciPy and by the rows of each rank; also after the matrix changed."""
     monkeypatch.setattr(petsc, "BLOCK_ENTRIES", entries)
     monkeypatch.setattr(petsc, "FEW_ENTRIES", entries)
+    monkeypatch.setattr(petsc, "COPIED_ENTRIES", entries)
     system = build(make_scene({}), comm=comm).system
     layout, start = system.layout, system.layout.start
     X = np.random.default_rng(1).standard_normal((layout.n_e, columns))
