@@ -149,11 +149,13 @@ class BlockSystem(Shown):
     def release(self) -> None:
         """Free the matrices of the affine components, three of the seven of a step, where no more are made. Collective.
 
-        The system steps as before; :meth:`with_materials`, reductions and bounds need what is gone.
+        The system steps as before; :meth:`with_materials`, reductions and bounds need what is gone. Own springs at
+        finite strain stay, whose steps use them.
         """
-        for layer in self.layers:
-            for component in (layer.K_mu, layer.K_lambda, layer.M_1):
-                component.ee.destroy()
+        for layer, m in zip(self.layers, self.materials, strict=True):
+            if self.points is None or m.adds != "stiffness":
+                for component in (layer.K_mu, layer.K_lambda, layer.M_1):
+                    component.ee.destroy()
 
     def with_materials(self, materials: tuple[LayerMaterial, ...]) -> BlockSystem:
         """The same scene with other lambda, mu, rho, beta: a few axpy, no assembly. Collective.

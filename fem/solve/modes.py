@@ -190,9 +190,18 @@ def _collect(eps: SLEPc.EPS, system: BlockSystem, k: int, vectors: list[PETSc.Ve
 
 def _finish(solver: TissueSolver, system: BlockSystem, modes: list[PETSc.Vec]) -> tuple[Array, Array]:
     """Normalise, fix the signs and check the residuals |K phi - omega^2 M phi|_(K^-1) / omega. Collective."""
-    comm, rtol = system.layout.comm, solver.ksp.getTolerances()[0]
+    rtol = solver.ksp.getTolerances()[0]
     if solver.name in ITERATIVE:  # a number to one digit
         solver.ksp.setTolerances(rtol=0.1)
+    try:
+        return _checked(solver, system, modes)
+    finally:  # others share the solver
+        solver.ksp.setTolerances(rtol=rtol)
+
+
+def _checked(solver: TissueSolver, system: BlockSystem, modes: list[PETSc.Vec]) -> tuple[Array, Array]:
+    """See :func:`_finish`; the tolerance of the solver is set. Collective."""
+    comm = system.layout.comm
     omega, Phi = np.empty(len(modes)), np.empty((system.layout.n_local, len(modes)), order="F")
     y, r = system.K_ee.createVecs()
     compass = _generic(system, 0)
@@ -213,7 +222,6 @@ def _finish(solver: TissueSolver, system: BlockSystem, modes: list[PETSc.Vec]) -
             )
         omega[i] = np.sqrt(square)
         Phi[:, i] = phi.array_r
-    solver.ksp.setTolerances(rtol=rtol)
     y.destroy()
     r.destroy()
     return omega, Phi

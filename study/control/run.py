@@ -69,6 +69,8 @@ def run_control(
             word = "going on from" if exists else "interrupted, the same command goes on from"
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
         plant = linearised(model)
+        if not retune:
+            model.system.release()
         observed, study = None, cast(GainStudy | None, None)
         if control_of(model).observer is not None:
             from softgrasp.lqr.design.observer import require_observable  # no other scene needs it

@@ -14,16 +14,15 @@ import sys
 from collections.abc import Iterator
 from types import FrameType
 
+PLUGINS = "PYDANTIC_DISABLE_PLUGINS"  # variable of the environment
 UNUSED = ("f2py", "ma", "testing")  # parts of numpy that SciPy loads to copy their names
 
 
 def quiet_imports() -> None:
     """Let Ctrl-C end the program at once while modules load, where KeyboardInterrupt would tear compiled ones apart.
 
-    Leaves any handler but Python's own alone. Pydantic does not look for plugins, which would read the metadata of all
-    installed packages, unless PYDANTIC_DISABLE_PLUGINS is set.
+    Leaves any handler but Python's own alone.
     """
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         with contextlib.suppress(ValueError):  # not the main thread
             signal.signal(signal.SIGINT, _interrupt)
@@ -43,14 +42,18 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 def loading() -> Iterator[None]:
     """Import here what computes: without garbage collections, and without the parts of numpy that nothing here uses.
 
-    numpy loads those when somebody asks for them.
+    numpy loads those when somebody asks for them. Pydantic does not look for plugins, which would read the metadata of
+    all installed packages, unless PYDANTIC_DISABLE_PLUGINS is set; child programs inherit no such variable.
     """
-    collects = gc.isenabled()
+    collects, given = gc.isenabled(), PLUGINS in os.environ
     gc.disable()
+    os.environ.setdefault(PLUGINS, "__all__")
     try:
         _load_scipy()
         yield
     finally:
+        if not given:
+            os.environ.pop(PLUGINS, None)
         if collects:
             gc.enable()
 

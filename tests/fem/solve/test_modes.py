@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import times_columns, total
-from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.fem.solve.modes import _finish, lowest_modes
 from softgrasp.fem.solve.solvers import SolverName
+from softgrasp.fem.solve.stiffness import factored_stiffness
 
 SQUARE = ["tissue.refine=false", "contact.sides=['top']", "tissue.cells=[2,2,4]"]  # bending in x and y are alike
 
@@ -31,3 +33,15 @@ def test_modes_without_a_factor(
     assert np.abs(found / omega - 1).max() < 1e-10
     cosines = np.linalg.svd(total(comm, times_columns(system.M_ee, Phi).T @ others))[1]
     assert np.abs(cosines - 1).max() < 1e-12  # of angles of 1e-8 between the spans
+
+
+@pytest.mark.serial
+def test_a_shared_solver_keeps_its_tolerance_where_no_mode_passes() -> None:
+    system = build("block_3d", [*SQUARE, "tissue.order=1"]).system
+    with factored_stiffness(system, "cg") as solver:
+        before = solver.ksp.getTolerances()
+        vector = system.K_ee.createVecRight()
+        vector.set(1.0)  # no mode
+        with pytest.raises(SolverError, match="mode 1 has the relative residual"):
+            _finish(solver, system, [vector])
+        assert solver.ksp.getTolerances() == before

@@ -3,6 +3,7 @@
 import gc
 import importlib
 import importlib.util
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from softgrasp.fem import _stack
-from softgrasp.study.shell.loading import loading
+from softgrasp.study.shell.loading import PLUGINS, loading
 
 STARTED = """
-import gc, importlib.metadata, sys
+import gc, importlib.metadata, os, sys
 def read(*_, **__):
     raise AssertionError("the metadata of all packages were read")
 importlib.metadata.distributions = importlib.metadata.entry_points = read
@@ -23,6 +24,7 @@ line = ["simulate", "paper_forward", "--no-pictures", "--set", "tissue.cells=[2,
 done = CliRunner().invoke(app, [*line, "--out", sys.argv[1]])
 assert done.exit_code == 0, done.output
 assert gc.isenabled()
+assert "PYDANTIC_DISABLE_PLUGINS" not in os.environ
 print(*sorted({"numpy.f2py", "numpy.testing", "h5py", "matplotlib", "PIL"} & set(sys.modules)))
 import numpy
 assert numpy.ma.masked_less([1, 2], 2).sum() == 2
@@ -38,11 +40,16 @@ def test_a_run_loads_no_part_that_it_does_not_use(tmp_path: Path) -> None:
 
 
 @pytest.mark.serial
-def test_collections_are_on_again_where_an_import_fails() -> None:
+@pytest.mark.parametrize("given", [None, "logfire"])
+def test_all_is_as_before_where_an_import_fails(given: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    if given is None:
+        monkeypatch.delenv(PLUGINS, raising=False)
+    else:
+        monkeypatch.setenv(PLUGINS, given)
     on = []
     with pytest.raises(ModuleNotFoundError), loading():
-        on.append(gc.isenabled()) or importlib.import_module("softgrasp.no_such_module")
-    assert [*on, gc.isenabled()] == [False, True]
+        on.extend([gc.isenabled(), os.environ[PLUGINS]]) or importlib.import_module("softgrasp.no_such_module")
+    assert [*on, gc.isenabled(), os.environ.get(PLUGINS)] == [False, given or "__all__", True, given]
 
 
 @pytest.mark.serial
