@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, cast
 
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.solve.solvers import (
@@ -26,6 +26,13 @@ PREFIX = "softgrasp_stiffness_"
 SHARED = "shared factors"  # key of those in system.kept, by name with what they belong to
 
 
+class Shared(Protocol):
+    """A factor, or what holds one."""
+
+    def destroy(self) -> None:
+        """Free it. Collective."""
+
+
 @contextmanager
 def sharing_factors(system: BlockSystem, large: bool = True) -> Iterator[None]:
     """Factors made inside stay with the system to the end of the block, on any ranks. Collective.
@@ -35,7 +42,7 @@ def sharing_factors(system: BlockSystem, large: bool = True) -> Iterator[None]:
     if SHARED in system.kept or not (large or system.layout.n_e <= KEPT_LIMIT[system.layout.dimension]):
         yield
         return
-    shared: dict[str, tuple[object, TissueSolver]] = {}
+    shared: dict[str, tuple[object, Shared]] = {}
     system.kept[SHARED] = shared
     try:
         yield
@@ -46,14 +53,12 @@ def sharing_factors(system: BlockSystem, large: bool = True) -> Iterator[None]:
 
 
 @contextmanager
-def shared_factor(
-    system: BlockSystem, name: str, key: object, make: Callable[[], TissueSolver]
-) -> Iterator[TissueSolver]:
-    """The last solver of a name if its key is this one; else a new one, freed at the end unless shared. Collective."""
+def shared_factor[S: Shared](system: BlockSystem, name: str, key: object, make: Callable[[], S]) -> Iterator[S]:
+    """The last factor of a name if its key is this one; else a new one, freed at the end unless shared. Collective."""
     shared = system.kept.get(SHARED)
     old = None if shared is None else shared.get(name)
     if old is not None and old[0] == key:
-        yield old[1]
+        yield cast(S, old[1])  # names stand for types too
         return
     if shared is not None and old is not None:
         del shared[name]

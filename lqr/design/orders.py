@@ -11,6 +11,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.lqr.design.duration import LoopPlan
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.scene import control_of
+from softgrasp.lqr.loop.full import ClosedLoop
 from softgrasp.lqr.loop.gap import Course, duality_gaps
 from softgrasp.lqr.loop.responses import Notify as Notify
 from softgrasp.lqr.plant.checks import ControlError
@@ -143,6 +144,7 @@ def with_bounds[Figures: GainQuality](
     gains: Iterable[Figures],
     course: Course,
     notify: Notify | None = None,
+    loop: ClosedLoop | None = None,
 ) -> list[Figures]:
     """The same with cost and bounds of the loop as it runs, where nothing rules the gain out. Collective.
 
@@ -152,6 +154,7 @@ def with_bounds[Figures: GainQuality](
 
     Args:
         solution: gives the cost after the end of the run; its error does not matter to the bound.
+        loop: see :func:`softgrasp.lqr.loop.responses.responses`.
     """
     gains = list(gains)
     laws: dict[int, Gain] = {i: g.gain for i, g in enumerate(gains) if g.promising and g.gain is not None}
@@ -159,7 +162,7 @@ def with_bounds[Figures: GainQuality](
         return gains
     for more in range(LONGER + 1):
         longer = replace(course, steps=course.steps << more)
-        gaps = duality_gaps(problem, list(laws.values()), longer, solution, notify)
+        gaps = duality_gaps(problem, list(laws.values()), longer, solution, notify, loop)
         offered = [gap for i, gap in zip(laws, gaps, strict=True) if gains[i].stable and np.isfinite(gap.gap)]
         if all(gap.settled for gap in offered):
             break
@@ -177,10 +180,14 @@ def course_of(design: Design, plan: LoopPlan) -> Course:
 
 
 def bases_with_bounds(
-    design: Design, bases: Sequence[BasisGains], plan: LoopPlan, notify: Notify | None = None
+    design: Design,
+    bases: Sequence[BasisGains],
+    plan: LoopPlan,
+    notify: Notify | None = None,
+    loop: ClosedLoop | None = None,
 ) -> tuple[BasisGains, ...]:
-    """All gains of all bases from the same few runs. Collective."""
+    """All gains of all bases from the same few runs, see :func:`with_bounds`. Collective."""
     reports = (r for b in bases for r in b.reports)
-    every = with_bounds(design.problem, design.solution, reports, course_of(design, plan), notify)
+    every = with_bounds(design.problem, design.solution, reports, course_of(design, plan), notify, loop)
     rest = iter(every)
     return tuple(replace(b, reports=tuple(next(rest) for _ in b.reports)) for b in bases)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -213,6 +214,13 @@ class ClosedLoop:
             return run.trajectory(actuation)
         finally:
             touching.release()
+
+    def of_differences(self) -> ClosedLoop:
+        """The same factor for differences of two states, which feel no gravity; no own loads act. Collective."""
+        system = replace(self.problem.system, gravity=None, hand_weight=False)
+        result = copy(self)
+        result.problem, result.plant = replace(self.problem, system=system), HandStep(system, self.midpoint, True)
+        return result
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""

@@ -36,6 +36,7 @@ import numpy as np
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.loop.actuation import Actuation
+from softgrasp.lqr.loop.full import ClosedLoop
 from softgrasp.lqr.loop.responses import Notify, Responses, causal, loop_inputs, responses
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
@@ -98,6 +99,7 @@ def duality_gaps(
     course: Course,
     solution: RiccatiSolution | None = None,
     notify: Notify | None = None,
+    loop: ClosedLoop | None = None,
 ) -> tuple[DualityGap, ...]:
     """Duality gaps of the loops under some gains, as they run from one start. Collective.
 
@@ -110,6 +112,7 @@ def duality_gaps(
         solution: Z, and the optimal law, whose own run gives the best lower bound of the least cost; None: with the
             cost up to the end alone.
         notify: called with the number of steps done and in all.
+        loop: see :func:`softgrasp.lqr.loop.responses.responses`.
 
     Raises SolverError: a solve failed.
     """
@@ -120,7 +123,7 @@ def duality_gaps(
     parts = [Block(hand, tall), *(gain.block for gain in every)]
     if solution is not None:
         parts.append(descriptor_adjoint(problem, solution.factor))
-    seen = responses(problem, Block.join(parts), course.start, course.dt, course.steps, notify)
+    seen = responses(problem, Block.join(parts), course.start, course.dt, course.steps, notify, loop)
     first = p + len(every) * n_s
     outputs, end = seen.part(slice(p)).at_midpoints(), seen.part(slice(first, None))
     laws = [seen.part(slice(p + i * n_s, p + (i + 1) * n_s)) for i in range(len(every))]

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.fft
 
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.solve.solvers import ITERATIVE
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.loop.drive import OpenDrive
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopRun
@@ -47,9 +47,17 @@ class Responses:
 def causal(kernel: Array, x: Array) -> Array:
     """sum_{k <= n} kernel_{n-k} x_k for every n by FFT; kernel (steps, a, b), x (steps, b)."""
     steps = len(x)
-    size = scipy.fft.next_fast_len(2 * steps, real=True)
-    both = np.einsum("wab,wb->wa", scipy.fft.rfft(kernel, size, axis=0), scipy.fft.rfft(x, size, axis=0))
-    return np.asarray(scipy.fft.irfft(both, size, axis=0)[:steps])
+    size = _fast_length(2 * steps)
+    both = np.einsum("wab,wb->wa", np.fft.rfft(kernel, size, axis=0), np.fft.rfft(x, size, axis=0))
+    return np.asarray(np.fft.irfft(both, size, axis=0)[:steps])
+
+
+def _fast_length(n: int) -> int:
+    """Least 2^a 3^b 5^c >= n; scipy.fft has a function for it and takes a tenth of a second to import."""
+    bits, least = n.bit_length(), 1 << n.bit_length()
+    for odd in (3**b * 5**c for b in range(bits) for c in range(bits)):
+        least = min(least, odd << max(0, (-(-n // odd) - 1).bit_length()))
+    return least
 
 
 def loop_inputs(law: Responses, actuation: Actuation, u_bar: Array) -> Array:
@@ -103,7 +111,13 @@ def _backwards(kernel: Array) -> Array:
 
 
 def responses(
-    problem: RiccatiProblem, W: Block, start: Block, dt: float, steps: int, notify: Notify | None = None
+    problem: RiccatiProblem,
+    W: Block,
+    start: Block,
+    dt: float,
+    steps: int,
+    notify: Notify | None = None,
+    loop: ClosedLoop | None = None,
 ) -> Responses:
     """One factor and n_s runs of the full plant, one more where the start moves by itself. Collective.
 
@@ -111,35 +125,44 @@ def responses(
         W: functionals as columns of the size of the state.
         start: x(0) as a difference to a state of rest, one column.
         notify: called with the number of steps done and in all.
+        loop: a loop of the plant, whose factor serves if it is exact and of this step; None for none.
 
     Raises SolverError: a solve failed.
     """
-    n_s, n = problem.layout.n_s, problem.layout.n_local
-    # differences of two states feel no gravity and no own loads
-    layers = tuple(replace(layer, load=None) for layer in problem.system.layers)
-    problem = replace(problem, system=replace(problem.system, layers=layers, gravity=None, hand_weight=False))
+    made: ClosedLoop | None = None
+    if loop is None or loop.dt != dt or loop.solver.name in ITERATIVE or problem.system.own_load is not None:
+        # differences of two states feel no own loads
+        layers = tuple(replace(layer, load=None) for layer in problem.system.layers)
+        loop = made = ClosedLoop(replace(problem, system=replace(problem.system, layers=layers)), dt)
+    try:
+        return _answers(loop.of_differences(), W, start, steps, notify)
+    finally:
+        if made is not None:
+            made.destroy()
+
+
+def _answers(loop: ClosedLoop, W: Block, start: Block, steps: int, notify: Notify | None) -> Responses:
+    """See :func:`responses`. Collective."""
+    n_s, n, comm = loop.problem.layout.n_s, loop.problem.layout.n_local, loop.problem.layout.comm
     rest = PlantState(np.zeros(n_s), np.zeros(n_s), np.zeros(n), np.zeros(n))
     begin = PlantState(*(part[:, 0] for part in start.parts))
     inputs = np.zeros((n_s + 1, steps, n_s))
     inputs[range(n_s), 0, range(n_s)] = 1.0
     runs = [(rest, u) for u in inputs[:n_s]]
-    still = total(problem.layout.comm, np.array([np.abs(start.tall).sum()]))[0] == 0 and not begin.v_s.any()
+    still = total(comm, np.array([np.abs(start.tall).sum()]))[0] == 0 and not begin.v_s.any()
     if not still:
         runs.append((begin, inputs[-1]))
-    loop, values = ClosedLoop(problem, dt), list[Array]()
+    values = list[Array]()
 
     def progress(run: Any) -> None:
         if notify is not None:
             notify(len(values) * steps + run.reached, len(runs) * steps)
 
-    try:
-        for state, u in runs:
-            values.append(_Record(loop, W, state, u, LoopOptions(progress=progress)).values())
-    finally:
-        loop.destroy()
+    for state, u in runs:
+        values.append(_Record(loop, W, state, u, LoopOptions(progress=progress)).values())
     # a body displaced rigidly stays there
     free = np.tile(start.hand[:, 0] @ W.hand, (steps + 1, 1)) if still else values[-1]
-    return Responses(dt, np.stack(values[:n_s], axis=-1), free)
+    return Responses(loop.dt, np.stack(values[:n_s], axis=-1), free)
 
 
 class _Record(LoopRun):

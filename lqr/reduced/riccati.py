@@ -190,6 +190,7 @@ class GainCheck:
         self.start = start
         self.loop = ModalLoop(problem) if loop is None else loop
         self.law, self.ticks = law, SampledLoop(problem, self.loop)
+        self._shift: float | None = None  # of the certificate of the last gain, which the next one shares
         self.optimal = float(np.sum(gram(problem.layout.comm, Z, descriptor(problem, start)) ** 2))
         if not self.optimal > 0:
             raise ControlError("the start is the target: nothing moves, so the cost of a gain cannot be compared")
@@ -223,7 +224,8 @@ class GainCheck:
             return self._of_poles(K, self.loop)
         fits = self.problem.layout.n_e <= DENSE_LIMIT
         try:
-            spectrum = abscissa(self.problem, gain, self._tail_modes)
+            spectrum = abscissa(self.problem, gain, self._tail_modes, self._shift)
+            self._shift = spectrum.shift
         except SolverError:
             if not fits:
                 raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from slepc4py import SLEPc
@@ -12,7 +13,7 @@ from slepc4py import SLEPc
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc, from_options, total
 from softgrasp.fem.shown import Shown
-from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
+from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from softgrasp.fem.solve.stiffness import shared_factor
 from softgrasp.fem.system import dynamic_stiffness
 from softgrasp.lqr.dense.modal import modes_of_plant
@@ -63,7 +64,9 @@ class Abscissa(Shown):
         return self.certified and self.value < 0
 
 
-def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | None = None) -> Abscissa:
+def abscissa(
+    problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | None = None, shift: float | None = None
+) -> Abscissa:
     """Largest real part of the spectrum of x' = (A + B K) x [1/s], with a certificate of its sign. Collective.
 
     Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it:
@@ -71,7 +74,8 @@ def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | N
     |s - sigma| <= d with d^2 = r^2 + sigma^2 contains all others with Re s >= 0. Kelvin-Voigt damping makes infinitely
     many eigenvalues accumulate at -1/beta as the mesh gets finer; sigma is chosen so that the circle leaves them
     outside. One solve with sigma^2 M_ee + sigma D_ee + K_ee a step, factored once; the few inputs enter by
-    Sherman-Morrison-Woodbury.
+    Sherman-Morrison-Woodbury. Inside `softgrasp.fem.solve.stiffness.sharing_factors` gains of one sigma share the
+    factor and what the inputs answer without feedback.
 
     The Krylov space starts from a vector without symmetry, and only eigenvalues before the first one that has not
     converged count; the circle passes through a gap between two of them.
@@ -80,6 +84,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | N
         problem: the plant; damped in every layer for a certificate.
         gain: u = K x.
         modes: see :class:`softgrasp.lqr.spectrum.tail.TailBound`, when they are there already.
+        shift: sigma of another gain of the plant, used while the certificate holds with it; None for the own one.
 
     Raises:
         ControlError: the plant has no hand.
@@ -102,36 +107,42 @@ def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | N
     why = why_no_bound(problem)
     tail = None if why else TailBound(problem, K, modes)
     # the same bits on every rank: they decide how often all search
-    aim, shift, guess = problem.layout.comm.bcast(_circle(problem, tail))
-    with resolvent_of(problem, K, shift) as resolvent:
-        for count in (guess, *(more for more in GROWTH if more > guess)):
-            number = min(count, problem.layout.states - 2)
-            values = resolvent.nearest(number)
-            result: Abscissa = problem.layout.comm.bcast(_conclude(values, shift, tail, why))
-            short = len(values) < number  # asking for more would not help
-            enough = result.certified and (result.exact or result.radius >= ENOUGH * aim)
-            if result.value >= 0 or short or enough or why:
-                break
+    aim, own, guess = problem.layout.comm.bcast(_circle(problem, tail))
+    for sigma in (own,) if shift is None else (shift, own):
+        result = _searched(problem, K, tail, why, aim, sigma, guess)
+        if result.certified or why:
+            break
+    return result
+
+
+def _searched(
+    problem: RiccatiProblem, K: Block, tail: TailBound | None, why: str, aim: float, shift: float, guess: int
+) -> Abscissa:
+    """Result with eigenvalues nearest to a shift, more of them until they cover the radius ``aim``. Collective."""
+    with open_loop_of(problem, shift) as plant:
+        resolvent = Resolvent(plant, K)
+        try:
+            for count in (guess, *(more for more in GROWTH if more > guess)):
+                number = min(count, problem.layout.states - 2)
+                values = resolvent.nearest(number)
+                result: Abscissa = problem.layout.comm.bcast(_conclude(values, shift, tail, why))
+                short = len(values) < number  # asking for more would not help
+                enough = result.certified and (result.exact or result.radius >= ENOUGH * aim)
+                if result.value >= 0 or short or enough or why:
+                    break
+        finally:
+            resolvent.shell.destroy()
     return result
 
 
 @contextmanager
-def resolvent_of(problem: RiccatiProblem, K: Block, shift: float) -> Iterator[Resolvent]:
-    """The resolvent with a factor that gains of one shift share. Collective."""
-    system, layout = problem.system, problem.layout
+def open_loop_of(problem: RiccatiProblem, shift: float) -> Iterator[OpenLoop]:
+    """The plant without feedback at a shift, which gains share. Collective."""
+    system = problem.system
     matrices = [A for A in (system.K_ee, system.M_ee, system.damping.matrix) if A is not None]
     key = shift, system.damping.alpha, system.damping.beta, *((A.handle, A.stateGet()) for A in matrices)
-
-    def make() -> TissueSolver:
-        name = choose_solver(layout, few=True)[0]
-        return make_solver(dynamic_stiffness(system, shift), name, layout, PREFIX, rtol=1e-12)
-
-    with shared_factor(system, "resolvent", key, make) as solver:
-        resolvent = Resolvent(problem, K, shift, solver)
-        try:
-            yield resolvent
-        finally:
-            resolvent.shell.destroy()
+    with shared_factor(system, "resolvent", key, partial(OpenLoop, problem, shift)) as plant:
+        yield plant
 
 
 def _circle(problem: RiccatiProblem, tail: TailBound | None) -> tuple[float, float, int]:
@@ -178,35 +189,35 @@ def _conclude(values: np.ndarray, shift: float, tail: TailBound | None, why: str
     return Abscissa(value, not reason, radius, bound, values, reason, exact, shift)
 
 
-class Resolvent:
-    """y = (sigma E - A - B K)^{-1} E x as a PETSc shell; local rows [hand on rank 0; z; v]."""
+class OpenLoop:
+    """x = (sigma E - A)^{-1} b with one factor of sigma^2 M_ee + sigma D_ee + K_ee, made here. Collective.
 
-    def __init__(self, problem: RiccatiProblem, K: Block, shift: float, solver: TissueSolver) -> None:
-        self.problem, self.K, self.shift, self.solver = problem, K, shift, solver
+    Attributes:
+        columns: (sigma E - A)^{-1} B, n_s columns.
+    """
+
+    def __init__(self, problem: RiccatiProblem, shift: float) -> None:
+        self.problem, self.shift = problem, shift
         self.system, self.layout, self.comm = problem.system, problem.layout, problem.layout.comm
-        self.n_s, self.n = self.layout.n_s, self.layout.n_local
         self.drag = self.system.damping.drag
-        self.extra = 2 * self.n_s if self.comm.rank == 0 else 0
-        local = 2 * self.n + self.extra
-        self.shell = PETSc.Mat().createPython(((local, self.layout.states),) * 2, self, comm=self.comm)
-        self.shell.setUp()
-        self._prepare()
-
-    def _prepare(self) -> None:
-        """The hand's Schur complement, and the inputs' columns for the feedback. Collective."""
-        system, sigma, n_s = self.system, self.shift, self.n_s
-        hand = sigma**2 * self.problem.M_s
+        name = choose_solver(self.layout, few=True)[0]
+        self.solver = make_solver(dynamic_stiffness(self.system, shift), name, self.layout, PREFIX, rtol=1e-12)
+        system, sigma, n_s = self.system, shift, self.layout.n_s
+        hand = sigma**2 * problem.M_s
         if system.two_way:
             self.S_G = self.solver.columns(system.G)
             factor = sigma**2 + sigma * self.drag
             hand = hand + sigma * self.drag * system.M_rigid
             hand = hand - factor**2 * total(self.comm, system.G.T @ self.S_G)
         self.hand = np.linalg.inv(hand)
-        loads = Block(np.eye(2 * n_s, n_s, -n_s), np.zeros((2 * self.n, n_s)))
-        self.columns = Block.join([self._open(loads[i : i + 1]) for i in range(n_s)])
-        self.small = np.linalg.inv(np.eye(n_s) - gram(self.comm, self.K, self.columns))
+        loads = Block(np.eye(2 * n_s, n_s, -n_s), np.zeros((2 * self.layout.n_local, n_s)))
+        self.columns = Block.join([self.solve(loads[i : i + 1]) for i in range(n_s)])
 
-    def _open(self, b: Block) -> Block:
+    def destroy(self) -> None:
+        """Free the factor. Collective."""
+        self.solver.destroy()
+
+    def solve(self, b: Block) -> Block:
         """(sigma E - A)^{-1} b for one column. Collective."""
         system, sigma, (a_s, b_s, a, f) = self.system, self.shift, b.parts
         # v = sigma q - a: the displacements alone remain
@@ -225,17 +236,30 @@ class Resolvent:
             z = self.solver.columns(force - factor * (system.G @ q_s))
         return Block.of_parts(q_s, sigma * q_s - a_s, z, sigma * z - a)
 
+
+class Resolvent:
+    """y = (sigma E - A - B K)^{-1} E x as a PETSc shell; local rows [hand on rank 0; z; v]."""
+
+    def __init__(self, plant: OpenLoop, K: Block) -> None:
+        self.plant, self.K = plant, K
+        self.layout, self.comm, self.n_s = plant.layout, plant.comm, plant.layout.n_s
+        self.extra = 2 * self.n_s if self.comm.rank == 0 else 0
+        local = 2 * self.layout.n_local + self.extra
+        self.shell = PETSc.Mat().createPython(((local, self.layout.states),) * 2, self, comm=self.comm)
+        self.shell.setUp()
+        self.small = np.linalg.inv(np.eye(self.n_s) - gram(self.comm, K, plant.columns))
+
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Apply y = (sigma E - A - B K)^{-1} E x. Collective."""
         local = x.array_r
         hand = np.array(local[: self.extra]) if self.extra else np.empty(2 * self.n_s)
         self.comm.Bcast(hand)
         state = Block(hand[:, None], np.array(local[self.extra :])[:, None])
-        answer = self._open(descriptor(self.problem, state))
+        answer, columns = self.plant.solve(descriptor(self.plant.problem, state)), self.plant.columns
         input_ = self.small @ gram(self.comm, self.K, answer)
         out = y.array_w
-        out[: self.extra] = (answer.hand + self.columns.hand @ input_)[: self.extra, 0]
-        out[self.extra :] = (answer.tall + self.columns.tall @ input_)[:, 0]
+        out[: self.extra] = (answer.hand + columns.hand @ input_)[: self.extra, 0]
+        out[self.extra :] = (answer.tall + columns.tall @ input_)[:, 0]
 
     def nearest(self, count: int) -> np.ndarray:
         """The ``count`` eigenvalues nearest to the shift, or as many as converge before the first that does not.
@@ -275,4 +299,4 @@ class Resolvent:
         finally:
             eps.destroy()
             start.destroy()
-        return np.asarray(self.comm.bcast(self.shift - 1 / theta))
+        return np.asarray(self.comm.bcast(self.plant.shift - 1 / theta))

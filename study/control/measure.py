@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import timeit
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -119,7 +120,20 @@ def run_finite(design: Design, model: Model, linear: LoopTrajectory, plan: LoopP
     return FiniteLoop(points.laws.name, run, target, reason, excess, *past)
 
 
-def run_loops(design: Design, bases: Sequence[BasisGains], plan: LoopPlan, frames: Frames, notify: Notify) -> LoopRuns:
+@contextmanager
+def loop_of(design: Design, plan: LoopPlan, meets: Model | None) -> Iterator[ClosedLoop]:
+    """The full plant with one factor for bounds and runs. Collective. ``meets``: gives the obstacles; None for none."""
+    time = design.model.scene.time
+    loop = ClosedLoop(design.problem, plan.dt, time.solver, time.rtol, time.reproducible, meets)
+    try:
+        yield loop
+    finally:
+        loop.destroy()
+
+
+def run_loops(
+    loop: ClosedLoop, design: Design, bases: Sequence[BasisGains], plan: LoopPlan, frames: Frames, notify: Notify
+) -> LoopRuns:
     """Full plant under the optimal gain, with frames, and under the best stable gain of each basis. Collective.
 
     Where the scene has contact, the optimal gain runs into its obstacles too, and the frames are of that run.
@@ -127,34 +141,30 @@ def run_loops(design: Design, bases: Sequence[BasisGains], plan: LoopPlan, frame
     """
     problem, scene, law = design.problem, design.model.scene, design.actuation
     others = [] if design.modal else best_gains(bases, problem.layout)
-    meets = frames.model if frames.model.scene.effects.obstacles else None
-    total, done = (len(others) + 1 + (meets is not None)) * plan.steps, 0
+    meets = loop.scene is not None
+    total, done = (len(others) + 1 + meets) * plan.steps, 0
 
     def progress(run: Any) -> None:
         notify(done + run.reached, total)
 
     shown = move_steps(plan.steps, plan.dt, plan.settle, 3 if frames.few else frame_count(scene, problem.layout.n_e))
     frames.chosen = set(shown)
-    loop = ClosedLoop(problem, plan.dt, scene.time.solver, scene.time.rtol, scene.time.reproducible, meets)
     options = LoopOptions(progress=progress, most=largest_cost(design, plan))
     reduced, touching = [], None
-    try:
-        filmed = replace(options, frames=shown, frame=frames)
-        full = loop.run(design.gain, design.target, plan.steps, law, design.start, options if meets else filmed)
-        if meets:
-            done += plan.steps
-            touching = _touching(design, full, partial(loop.run, options=replace(filmed, touching=True)))
-        for report in others:
-            done += plan.steps
-            if report.gain is None:
-                continue
-            try:
-                run = loop.run(report.gain, design.target, plan.steps, law, design.start, options)
-                reduced.append(ReducedLoopRun(report.method, report.N, run))
-            except SolverError as error:  # limits or sampling may upset what the continuous law stabilises
-                reduced.append(ReducedLoopRun(report.method, report.N, None, str(error)))
-    finally:
-        loop.destroy()
+    filmed = replace(options, frames=shown, frame=frames)
+    full = loop.run(design.gain, design.target, plan.steps, law, design.start, options if meets else filmed)
+    if meets:
+        done += plan.steps
+        touching = _touching(design, full, partial(loop.run, options=replace(filmed, touching=True)))
+    for report in others:
+        done += plan.steps
+        if report.gain is None:
+            continue
+        try:
+            run = loop.run(report.gain, design.target, plan.steps, law, design.start, options)
+            reduced.append(ReducedLoopRun(report.method, report.N, run))
+        except SolverError as error:  # limits or sampling may upset what the continuous law stabilises
+            reduced.append(ReducedLoopRun(report.method, report.N, None, str(error)))
     to_come = predicted_cost(problem, design.solution, full.final - design.target.state)
     return LoopRuns(plan, full, to_come, tuple(reduced), law.bound(problem.layout.n_s), touching)
 

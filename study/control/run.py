@@ -25,6 +25,7 @@ from softgrasp.study.shell import Flags, Session, folder_lock
 
 if TYPE_CHECKING:  # observers are not imported where a scene has none
     from softgrasp.study.control.observer.result import ObservedStudy
+    from softgrasp.study.control.obstacle.result import PlannedStudy
 
 WITHOUT_CONTACT = (
     "Gains, bounds and margins are those of the plant without obstacles: no certificate covers contact, and "
@@ -88,8 +89,11 @@ def run_control(
                 observed = observed_study(feedback, watch)
             if gain_only:
                 study = replace(small_study(feedback, watch, sentence), observed=observed)
+            else:
+                planned = planned_of(model, feedback, watch, bar, observed)
+                gains = reduced_gains(feedback, watch, bar)
         if study is None:
-            study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence, observed)
+            study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence, observed, planned, gains)
             if retune:
                 study = with_retuning(model, study, watch, bar)
     with watch.stage("controllers"):
@@ -145,6 +149,27 @@ def end_state(model: Model, study: GainStudy) -> PlantState:
     return finite_problem(study.design.problem, model.system, study.design.target)[1].state
 
 
+def planned_of(
+    model: Model, feedback: Design, watch: Stopwatch, bar: Progress, observed: ObservedStudy | None
+) -> PlannedStudy | None:
+    """The plan past obstacles, before all else, since what has no plan is refused; None without one. Collective."""
+    if control_of(model).constraints is None:
+        return None
+    from softgrasp.study.control.obstacle.measure import planned_study  # no other scene needs it
+
+    found = None if observed is None else observed.observed
+    return planned_study(feedback, model, watch, counted(bar, "plan on the full plant"), found)
+
+
+def reduced_gains(feedback: Design, watch: Stopwatch, bar: Progress) -> tuple[tuple[BasisGains, ...], str]:
+    """All reduced gains without their bounds, and why there are few or none. Collective."""
+    if feedback.modal:
+        return (), "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
+    sizes, reason = orders(feedback)
+    with watch.stage("reduced"):
+        return measure.timed_gains(feedback, sizes, counted(bar, "reduced equations")), reason
+
+
 def loop_study(
     session: Session,
     model: Model,
@@ -153,35 +178,30 @@ def loop_study(
     bar: Progress,
     note: str,
     observed: ObservedStudy | None,
+    planned: PlannedStudy | None,
+    gains: tuple[tuple[BasisGains, ...], str],
 ) -> tuple[ControlStudy, list[Path], Callable[[], list[Path]]]:
-    """All reduced gains and the closed loops. Collective.
+    """Bounds of all reduced gains and the closed loops. Collective.
 
     Returned are also the field files, and what waits for the pictures on rank 0.
     """
     duration = plan(feedback, own_end=not note)  # a scene made for control says how long its loop runs
-    finite_strain, sampled = model.system.points is not None, feedback.quality.sampled
-    planned = None
-    if control_of(model).constraints is not None:  # first: what has no plan is refused at once
-        from softgrasp.study.control.obstacle.measure import planned_study  # no other scene needs it
-
-        found = None if observed is None else observed.observed
-        planned = planned_study(feedback, model, watch, counted(bar, "plan on the full plant"), found)
-    bases: tuple[BasisGains, ...] = ()
-    if feedback.modal:
-        reason = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
-    else:
-        sizes, reason = orders(feedback)
-        with watch.stage("reduced"), sharing_factors(feedback.problem.system):
-            bases = measure.timed_gains(feedback, sizes, counted(bar, "reduced equations"))
-        with watch.stage("bounds"):
-            bases = bases_with_bounds(feedback, bases, duration, counted(bar, "duality gaps"))
+    finite_strain, sampled, touches = (
+        model.system.points is not None,
+        feedback.quality.sampled,
+        model.scene.effects.obstacles,
+    )
+    (bases, reason), frames = gains, Frames(model, session.out, session.pictures)
+    with measure.loop_of(feedback, duration, model if touches else None) as loop:
+        if not feedback.modal:
+            with watch.stage("bounds"):
+                bases = bases_with_bounds(feedback, bases, duration, counted(bar, "duality gaps"), loop)
+        with watch.stage("loop"):
+            loops = measure.run_loops(loop, feedback, bases, duration, frames, counted(bar, "closed loop"))
     small = measure.gain_study(feedback, bases, note, reason)
     lost = f"the loop from tick to tick is not certified: {sampled.reason}" if sampled and sampled.reason else ""
-    free = WITHOUT_CONTACT if model.scene.effects.obstacles else ""
+    free = WITHOUT_CONTACT if touches else ""
     notes = (*small.notes, *filter(None, (lost, unused_rate(model), duration.note, free)))
-    frames = Frames(model, session.out, session.pictures)
-    with watch.stage("loop"):
-        loops = measure.run_loops(feedback, bases, duration, frames, counted(bar, "closed loop"))
     finite = None
     if finite_strain:
         with watch.stage("finite strain"):
