@@ -73,14 +73,7 @@ def run_control(
         if not retune:
             model.system.release()
         observed, study = None, cast(GainStudy | None, None)
-        if control_of(model).observer is not None:
-            from softgrasp.lqr.design.observer import require_observable  # no other scene needs it
-
-            require_observable(plant)
-        if control_of(model).constraints is not None:
-            from softgrasp.lqr.design.constrained import require_plan  # no other scene needs it
-
-            require_plan(plant)
+        _require(plant)
         with sharing_factors(plant.system):
             feedback = design(plant, watch, solver_bar(bar, model), restart)
             if control_of(model).observer is not None:
@@ -116,6 +109,18 @@ def run_control(
         remove_own(out, restart)
     session.comm.Barrier()
     return result
+
+
+def _require(plant: Model) -> None:
+    """Refuse observers and plans that cannot be made, before the Riccati equation is solved. Collective."""
+    if control_of(plant).observer is not None:
+        from softgrasp.lqr.design.observer import require_observable  # no other scene needs it
+
+        require_observable(plant)
+    if control_of(plant).constraints is not None:
+        from softgrasp.lqr.design.constrained import require_plan  # no other scene needs it
+
+        require_plan(plant)
 
 
 def refuse_touching(scene: Scene) -> None:
