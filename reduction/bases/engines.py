@@ -10,7 +10,8 @@ every rank sees the same numbers. Limits, measured at sigma_j = 10^(-16 j / 599)
     gram    X' X and its eigenvalues (method of snapshots),       1e-6; nothing below 6e-8, so never the default
             fast, then one Rayleigh-Ritz step
 
-When a rank has fewer rows than the matrix has columns, it is small: each rank's QR and rank 0 do it, for tsqr and svd.
+When a rank has fewer rows than the matrix has columns, it is small: each rank's QR and rank 0 do it, for tsqr and svd;
+one rank alone factors nothing, as Q = I.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Factor:
     """scale * Q R = X up to rounding, or its best approximation of rank r where leading triplets are enough."""
 
     Q: Array  # local rows (n_local, r), orthonormal columns over all ranks
-    R: Array  # (r, c), the same bits on every rank
+    R: Array  # (r, c), the same bits on every rank; triangular where there are more rows than columns
     scale: float  # power of two that keeps squares of R from under- and overflow
     noise: float  # singular values below ``noise * sigma_1`` are rounding of the factorisation
     square: float  # sum of all sigma^2 of X / scale, also of those that are not in R
@@ -171,11 +172,10 @@ def _svd(comm: MPI.Intracomm, X: Array, rows: int, k: int | None) -> tuple[Array
 
 
 def _flat(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
-    """QR of what each rank has, then of the stacked triangles on rank 0: for few rows."""
-    with aside():
-        Q_local, R_local = np.linalg.qr(X)
+    """QR of what each rank has, then of the stacked triangles on rank 0, for few rows; of all rows I X itself."""
     if comm.size == 1:
-        return np.asfortranarray(Q_local), R_local
+        return np.eye(len(X), order="F"), X.copy()
+    Q_local, R_local = np.linalg.qr(X)
     parts, blocks, R = comm.gather(R_local), None, None
     with raise_on_all_ranks(comm):
         if parts is not None:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-import scipy.linalg
-from mpi4py import MPI
 
-from softgrasp.fem.petsc import Array, on_root
+from softgrasp.fem.petsc import Array
 from softgrasp.reduction.bases.basis import Coordinates
-from softgrasp.reduction.bases.engines import EngineName, Factor, factor, numerical_rank, small_svd
+from softgrasp.reduction.bases.engines import EngineName, numerical_rank, small_svd
 from softgrasp.reduction.bases.inner import InnerName, Rows, Weight, weights
-from softgrasp.reduction.bases.states import BasisError, Columns, States
+from softgrasp.reduction.bases.stack import Stack, cholesky_of, stack_of
+from softgrasp.reduction.bases.states import Columns, States
 from softgrasp.reduction.bases.truncation import Part
 
 
@@ -35,54 +35,27 @@ class PartsRequest:
         """Leading triplets that are enough, None when that is not known beforehand."""
         return self.count if self.share is None else None
 
-
-def cholesky_of(comm: MPI.Intracomm, G: Array) -> Array:
-    """Lower factor of a small Gram matrix (real or complex), the same bits on every rank. Collective.
-
-    Raises BasisError: the inner product is not positive definite.
-    """
-    try:
-        return on_root(comm, lambda: np.linalg.cholesky((G + G.T.conj()) / 2))
-    except np.linalg.LinAlgError as error:
-        raise BasisError(
-            "the inner product is not positive definite on the snapshots; check density, stiffness and contact zone"
-        ) from error
-
-
-def weighted_factor(
-    rows: Rows, X: Array, by: tuple[Weight, ...] | None, engine: EngineName, k: int | None = None
-) -> tuple[Factor, Array | None]:
-    """X = Q R with Q' Q = I, and the Cholesky factor L of Q' W Q (None without weight). Collective.
-
-    The columns of Q L^-T are orthonormal in W, and L' R are the coordinates of X in them. Because Q is orthonormal,
-    the condition of Q' W Q is at most that of W, not that of X.
-    """
-    f = factor(rows.layout.comm, X, engine, None if by is not None else k)
-    if by is None:
-        return f, None
-    return f, cholesky_of(rows.layout.comm, rows.gram(f.Q, rows.weigh(f.Q, by)))
+    def stack(
+        self,
+        name: str,
+        rows: Rows,
+        hand: Sequence[Array],
+        tissue: Callable[[], Array],
+        by: tuple[Weight, ...] | None,
+        k: int | None = None,
+    ) -> Stack:
+        """The snapshots of these rows in few coordinates, see :func:`softgrasp.reduction.bases.stack.stack_of`."""
+        return stack_of(self.snapshots.kept, (name, self.inner), rows, hand, tissue, by, self.engine, k)
 
 
-def pod_part(
-    title: str,
-    rows: Rows,
-    X: Array,
-    by: tuple[Weight, ...] | None,
-    engine: EngineName,
-    blocks: Sequence[int],
-    k: int | None = None,
-) -> Part:
+def pod_part(title: str, stack: Stack, blocks: Sequence[int]) -> Part:
     """POD_k(X): the k leading left singular vectors in the inner product W, U' W U = I. Collective.
 
     They minimise sum_j |x_j - U U' W x_j|_W^2.
 
-    Args:
-        X: snapshots, local rows (rows.local, m).
-        by: weight of every half; None is Euclidean.
-        blocks: which halves of a basis the rows of U are: 0 displacement, 1 velocity; the others are zero.
-        k: leading triplets that are enough, None for all.
+    ``blocks``: which halves of a basis the rows of U are: 0 displacement, 1 velocity; the others are zero.
     """
-    comm = rows.layout.comm
+    rows, comm = stack.rows, stack.rows.layout.comm
 
     def place(U: Array) -> tuple[Columns, ...]:
         halves = dict(zip(blocks, rows.split(U), strict=True))
@@ -92,21 +65,20 @@ def pod_part(
         )
         return (Columns(s_q, s_p, e_q, e_p),)
 
-    if not comm.allreduce(bool(np.any(X)), MPI.LOR):
+    if not stack.R.any():
         return Part(title, np.zeros(0), 0.0, 0, lambda _: place(np.zeros((rows.local, 0))))
-    f, L = weighted_factor(rows, X, by, engine, k)
-    u, s, _ = small_svd(comm, f.R if L is None else L.T @ f.R)
-    C = u if L is None else scipy.linalg.solve_triangular(L.T, u)
+    u, s, _ = small_svd(comm, stack.orthonormal)
 
     def columns(k: int) -> tuple[Columns, ...]:
-        U = f.Q @ C[:, :k]
-        if by is not None and k:
+        U = stack.vectors(u[:, :k])
+        if stack.by is not None and k:
             # one more step removes the rounding of L^-1; it is triangular, so the nested spans stay
-            repair = cholesky_of(comm, rows.gram(U, rows.weigh(U, by)))
+            repair = cholesky_of(comm, rows.gram(U, rows.weigh(U, stack.by)))
             U = U @ np.linalg.inv(repair.T)
         return place(U)
 
-    square = f.square if L is None else float(np.sum(s**2))
+    f = stack.factor
+    square = f.square if stack.by is None else float(np.sum(s**2))
     return Part(title, s, square, numerical_rank(s, f.noise), columns, f.scale)
 
 
@@ -117,9 +89,9 @@ def joint_parts(request: PartsRequest) -> tuple[Part, ...]:
     V' W V = I over displacement and velocity rows together. Collective.
     """
     b, rows = request.snapshots, Rows(request.states.layout, 2, request.hand)
-    X = rows.stack((b.s_q, b.e_q), (b.s_p, b.e_p))
     by = weights(request.states.system, request.inner)
-    return (pod_part("states", rows, X, by, request.engine, (0, 1), request.k),)
+    stack = request.stack("states", rows, (b.s_q, b.s_p), lambda: np.vstack([b.e_q, b.e_p]), by, request.k)
+    return (pod_part("states", stack, (0, 1)),)
 
 
 def componentwise_parts(request: PartsRequest) -> tuple[Part, ...]:
@@ -131,7 +103,8 @@ def componentwise_parts(request: PartsRequest) -> tuple[Part, ...]:
     b, rows = request.snapshots, Rows(request.states.layout, 1, request.hand)
     by = weights(request.states.system, request.inner)
     q, v = (None, None) if by is None else ((by[0],), (by[1],))
-    return (
-        pod_part("displacements", rows, rows.stack((b.s_q, b.e_q)), q, request.engine, (0,), request.k),
-        pod_part("velocities", rows, rows.stack((b.s_p, b.e_p)), v, request.engine, (1,), request.k),
+    halves = (("displacements", b.s_q, b.e_q, q), ("velocities", b.s_p, b.e_p, v))
+    return tuple(
+        pod_part(title, request.stack(title, rows, (hand,), partial(np.asarray, tissue), weight, request.k), (half,))
+        for half, (title, hand, tissue, weight) in enumerate(halves)
     )

@@ -15,39 +15,46 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.fem.solve.statics import solve_columns
-from softgrasp.reduction.bases.engines import Factor, magnitude, numerical_rank, small_svd
+from softgrasp.reduction.bases.engines import magnitude, numerical_rank, small_svd
 from softgrasp.reduction.bases.inner import Rows, Weight, weights
-from softgrasp.reduction.bases.pod import PartsRequest, cholesky_of, weighted_factor
-from softgrasp.reduction.bases.states import Columns
+from softgrasp.reduction.bases.pod import PartsRequest
+from softgrasp.reduction.bases.stack import Stack, cholesky_of
+from softgrasp.reduction.bases.states import BasisError, Columns
 from softgrasp.reduction.bases.svd_like import svd_like_pairs, symplectic_repair
 from softgrasp.reduction.bases.truncation import Part
 
 
 @dataclass(frozen=True)
 class Canonical:
-    """Snapshots q~ = Q L^-T C_q and y~ = Q L^-T C_y in the columns of one A-orthonormal basis."""
+    """Snapshots q~ and y~ in the columns of one A-orthonormal basis, those of the stack [q~, y~]."""
 
-    rows: Rows  # order in which the rows of one half are stacked
-    by: Weight | None  # the weight A, or None
-    factor: Factor  # Q and R = [R_q, R_y]
-    inverse: Array | None  # L^-T, or None
+    stack: Stack  # rows of one half, with the snapshots side by side
     C_q: Array  # coordinates of q~, (r, m), on every rank
     C_y: Array  # coordinates of y~, (r, m), on every rank
     rate: float  # c
     scale: float  # power of two divided out of the snapshots
     momenta: bool  # whether V_p needs the factor A (canonical coordinates)
 
+    @property
+    def rows(self) -> Rows:
+        """Order in which the rows of one half are stacked."""
+        return self.stack.rows
+
+    @property
+    def by(self) -> tuple[Weight, ...] | None:
+        """The weight A, or None."""
+        return self.stack.by
+
     def vectors(self, C: Array) -> Array:
-        """Q L^-T C, local rows."""
-        return np.asfortranarray(self.factor.Q @ (C if self.inverse is None else self.inverse @ C))
+        """Local rows of the vectors with coordinates C."""
+        return self.stack.vectors(C)
 
     def weigh(self, X: Array) -> Array:
         """A X. Collective."""
-        return self.rows.weigh(X, None if self.by is None else (self.by,))
+        return self.rows.weigh(X, self.by)
 
     def place(self, E_q: Array, E_y: Array) -> Columns:
         """Columns of V from q~ and y~ rows. Collective."""
@@ -59,40 +66,37 @@ class Canonical:
 
 
 def canonical(request: PartsRequest) -> Canonical:
-    """Factor [q~, y~] once, as real columns side by side: no Gram matrix, no complex arithmetic. Collective."""
+    """Factor [q~, y~] once, as real columns side by side: no Gram matrix, no complex arithmetic. Collective.
+
+    Raises BasisError: all snapshots are zero.
+    """
     b, system = request.snapshots, request.states.system
     rows, m = Rows(system.layout, 1, request.hand), b.e_q.shape[1]
     both = weights(system, request.inner)
-    by = None if both is None else both[0]
+    by = None if both is None else both[:1]
     momenta = request.coordinates == "qp"
-    comm = system.layout.comm
-    scale = magnitude(comm, b.s_q, b.s_p, b.e_q, b.e_p) if request.hand else magnitude(comm, b.e_q, b.e_p)
-    Z = np.empty((rows.local, 2 * m), order="F")
-    rows.fill(Z[:, :m], 0, b.s_q, b.e_q)
-    if by is not None and momenta:
-        hand = np.linalg.solve(by.hand, b.s_p / scale)
-        rows.fill(Z[:, m:], 0, hand, solve_columns(by.tissue, system.layout, b.e_p / scale))
-        Z[:, m:] *= scale
-    else:
-        rows.fill(Z[:, m:], 0, b.s_p, b.e_p)
-    Z /= scale
-    rate = 1.0
-    if by is not None and momenta:
-        rate = _rate(rows, Z, by, m)
-        Z[:, :m] *= rate**0.5
-        Z[:, m:] /= rate**0.5
-    f, L = weighted_factor(rows, Z, None if by is None else (by,), request.engine)
-    inverse = None if L is None else scipy.linalg.solve_triangular(L.T, np.eye(len(L)))
-    C = f.R if L is None else L.T @ f.R
-    return Canonical(rows, by, f, inverse, C[:, :m], C[:, m:], rate, scale * f.scale, momenta)
+    scale = magnitude(system.layout.comm, b.s_q, b.s_p, b.e_q, b.e_p)
+    s_p = b.s_p if by is None or not momenta else np.linalg.solve(by[0].hand, b.s_p / scale) * scale
 
+    def tissue() -> Array:
+        Z = np.empty((system.layout.n_local, 2 * m), order="F")
+        Z[:, :m] = b.e_q
+        Z[:, m:] = b.e_p
+        Z /= scale
+        if by is not None and momenta:
+            Z[:, m:] = solve_columns(by[0].tissue, system.layout, Z[:, m:])
+        return Z
 
-def _rate(rows: Rows, Z: Array, by: Weight, m: int) -> float:
-    """Rate c = |y|_A / |q|_A over all snapshots; 1 when one of them is zero. Collective."""
-    W_Z = rows.weigh(Z, (by,))
-    squares = np.array([np.vdot(Z[:, :m], W_Z[:, :m]), np.vdot(Z[:, m:], W_Z[:, m:])])
-    q, y = np.sqrt(np.maximum(total(rows.layout.comm, squares), 0.0))
-    return float(y / q) if q > 0 and y > 0 else 1.0
+    stack = request.stack("canonical", rows, (np.hstack([b.s_q, s_p]) / scale,), tissue, by)
+    if not stack.R.any():
+        raise BasisError("all snapshots are zero; there is nothing to build a basis from")
+    C, rate = stack.orthonormal, 1.0
+    C_q, C_y = C[:, :m], C[:, m:]
+    if by is not None and momenta:
+        q, y = (float(np.linalg.norm(part)) for part in (C_q, C_y))
+        rate = y / q if q > 0 and y > 0 else 1.0  # of all snapshots in A
+        C_q, C_y = C_q * rate**0.5, C_y / rate**0.5
+    return Canonical(stack, C_q, C_y, rate, scale * stack.scale, momenta)
 
 
 def complex_svd_parts(request: PartsRequest) -> tuple[Part, ...]:
@@ -167,4 +171,4 @@ def svd_like_parts(request: PartsRequest) -> tuple[Part, ...]:
 
 
 def _part(title: str, c: Canonical, s: Array, columns: Callable[[int], tuple[Columns, ...]]) -> Part:
-    return Part(title, s, float(np.sum(s**2)), numerical_rank(s, c.factor.noise), columns, c.scale, c.rate)
+    return Part(title, s, float(np.sum(s**2)), numerical_rank(s, c.stack.factor.noise), columns, c.scale, c.rate)

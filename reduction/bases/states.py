@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -36,6 +37,8 @@ class Columns:
     s_p: Array  # hand velocity, or momentum in canonical coordinates, (n_s, m), on every rank
     e_q: Array  # tissue displacement, local rows (n_local, m) [m]
     e_p: Array  # tissue velocity [m/s] or momentum [kg m/s], local rows (n_local, m)
+    # factors of these rows by name, which several bases use (softgrasp.reduction.bases.stack)
+    kept: dict[object, Any] = field(default_factory=dict, repr=False, compare=False)
 
     def first(self, k: int) -> Columns:
         """The leading k columns."""
@@ -49,7 +52,8 @@ class Columns:
             blocks = [getattr(part, key) for part in parts]
             whole = np.empty((len(blocks[0]), sum(block.shape[1] for block in blocks)), order="F")
             joined.append(np.concatenate(blocks, axis=1, out=whole))
-        return Columns(*joined)
+        s_q, s_p, e_q, e_p = joined
+        return Columns(s_q, s_p, e_q, e_p)
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,8 @@ class States:
 
     system: BlockSystem  # operators that the inner products use
     runs: tuple[tuple[BlockSystem, Snapshots], ...] = ()  # pairs of system and snapshots, all on one layout
+    # the last row blocks with their coordinates and frame, for the next basis
+    kept: dict[tuple[Coordinates, Frame], Columns] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def layout(self) -> BlockLayout:
@@ -69,7 +75,7 @@ class States:
         return self.system.layout
 
     def columns(self, coordinates: Coordinates, frame: Frame) -> Columns:
-        """Copy the snapshots into row blocks. Collective.
+        """Copy the snapshots into row blocks; the last ones stay for bases of the same coordinates. Collective.
 
         With z = q_e - T q_s:
 
@@ -82,13 +88,17 @@ class States:
         Raises:
             BasisError: there are no snapshots, or one of them is not finite.
         """
+        if known := self.kept.get((coordinates, frame)):
+            return known
         if not any(snapshots.Z.shape[1] for _, snapshots in self.runs):
             raise BasisError("there are no snapshots; run with output.snapshots = 'memory', or use craig_bampton")
         with raise_on_all_ranks(self.layout.comm):
             for system, snapshots in self.runs:
                 _check(self.layout, system, snapshots)
         parts = [_columns(system, snapshots, coordinates, frame) for system, snapshots in self.runs]
-        return parts[0] if len(parts) == 1 else Columns.beside(parts)
+        self.kept.clear()
+        self.kept[coordinates, frame] = made = parts[0] if len(parts) == 1 else Columns.beside(parts)
+        return made
 
 
 def whole_states(states: States) -> States:

@@ -33,6 +33,7 @@ from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.bases.inner import Rows, Weight
 from softgrasp.reduction.bases.pod import pod_part
+from softgrasp.reduction.bases.stack import stack_of
 from softgrasp.reduction.bases.states import BasisError
 from softgrasp.reduction.errors import column_blocks, ratio
 from softgrasp.reduction.online import ReducedTrajectory
@@ -320,7 +321,7 @@ def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
         q, p = (float(layout.comm.allreduce(np.vdot(Y, times_columns(system.M_ee, Y)))) for Y in (X, V))
         X = np.asfortranarray(np.hstack([X, V * (q / p) ** 0.5 if p > 0 else V]))
     rows, mass = Rows(layout, 1, hand=False), Weight(system.M_hand, system.M_ee)
-    part = pod_part("deformation", rows, X, (mass,), "tsqr", (0,), COLUMNS * k)
+    part = pod_part("deformation", stack_of({}, "deformation", rows, (), lambda: X, (mass,), "tsqr"), (0,))
     if k > part.rank:
         most = 2 * (layout.n_s + part.rank)
         raise BasisError(f"more displacements than the snapshots carry above rounding; request N <= {most}", most=most)

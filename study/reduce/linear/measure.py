@@ -205,14 +205,18 @@ def sweep(
     options: Reduction,
     progress: Progress = lambda done, of: None,
     made: Made | None = None,
+    states: States | None = None,
 ) -> MethodSweep:
     """One method at all its N. Collective. Raises SolverError: a factorisation failed.
 
-    ``made``: its bases, as of :func:`made_apart`; None: made here.
+    Args:
+        made: its bases, as of :func:`made_apart`; None: made here.
+        states: of the run, which several methods share; None: made here.
     """
     refused: dict[int, str] = {}
     if made is None:
-        made = *bases_of(name, states_of(full.model.system, full.snapshots), options.N, options, refused), refused
+        states = states or states_of(full.model.system, full.snapshots)
+        made = *bases_of(name, states, options.N, options, refused), refused
     bases, kept, refused = made
     points: list[Point] = []
     models: dict[int, ReducedModel] = {}
@@ -237,7 +241,9 @@ def sweep_all(
 
     states = states_of(full.model.system, full.snapshots)
     made = made_apart([(name, options.N) for name in names], states, options)
-    return tuple(sweep(name, full, options, partial(swept, i), made.pop(name, None)) for i, name in enumerate(names))
+    return tuple(
+        sweep(name, full, options, partial(swept, i), made.pop(name, None), states) for i, name in enumerate(names)
+    )
 
 
 def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | None) -> list[TestedModel]:
