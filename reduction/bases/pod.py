@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -29,6 +29,7 @@ class PartsRequest:
     engine: EngineName  # engine of the tall factorisation
     count: int | None  # largest N requested, None when only shares of energy are
     share: float | None  # smallest share of sum sigma^2 that may be dropped, None when only N are given
+    spared: list[float] = field(default_factory=list)  # processor times that other bases spent on the factors [s]
 
     @property
     def k(self) -> int | None:
@@ -45,7 +46,9 @@ class PartsRequest:
         k: int | None = None,
     ) -> Stack:
         """The snapshots of these rows in few coordinates, see :func:`softgrasp.reduction.bases.stack.stack_of`."""
-        return stack_of(self.snapshots.kept, (name, self.inner), rows, hand, tissue, by, self.engine, k)
+        made = stack_of(self.snapshots.kept, (name, self.inner), rows, hand, tissue, by, self.engine, k)
+        self.spared.append(made.spared)
+        return made
 
 
 def pod_part(title: str, stack: Stack, blocks: Sequence[int]) -> Part:

@@ -182,6 +182,9 @@ def make_bases(
     columns = [part.columns(max(c[i] for c in counts)) for i, part in enumerate(parts)]
     clock.append(time.thread_time())
     seconds = dict(zip(("snapshots", "factor", "vectors"), np.diff(clock).tolist(), strict=True))
+    # offline times of a method are those of the method alone
+    seconds["snapshots"] = snapshots.kept.setdefault("seconds", seconds["snapshots"])
+    seconds["factor"] += sum(request.spared)
     whole = Basis(
         method.key, states.layout, *(np.zeros((0, 0)),) * 4, method.coordinates, method.frame, method.structure,
         method.fixed, metric, parts[0].rate, method.pairs,

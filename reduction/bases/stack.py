@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -25,6 +26,7 @@ class Stack:
     R: Array  # coordinates [hand; tissue] of X / scale, the same on every rank
     L: Array | None  # Cholesky factor of the weight in these coordinates; None without weight
     by: tuple[Weight, ...] | None  # weight of every half; None is Euclidean
+    spared: float = 0.0  # processor time that another basis spent on the factor [s]
 
     @property
     def scale(self) -> float:
@@ -76,21 +78,24 @@ def stack_of(
     apart = engine == "tsqr" or not rows.hand
     inner = rows if not apart else replace(rows, hand=False)
     key = name, by is None, engine, whole, apart or rows.hand
+    spared = kept[key][2] if key in kept else 0.0
     if key not in kept:
+        begin = time.thread_time()
         X = tissue()
         if not apart:
             X = np.asfortranarray(np.vstack([*(h for h in hand if rows.top), X]))
         some = comm.allreduce(bool(np.any(X)), MPI.LOR)
         f = factor(comm, X, engine, whole) if some else Factor(X[:, :0], np.zeros((0, X.shape[1])), 1.0, EPS, 0.0)
-        kept[key] = f, None if by is None else cholesky_of(comm, inner.gram(f.Q, inner.weigh(f.Q, by)))
-    f, L = kept[key]
+        L = None if by is None else cholesky_of(comm, inner.gram(f.Q, inner.weigh(f.Q, by)))
+        kept[key] = f, L, time.thread_time() - begin
+    f, L, _ = kept[key]
     if not apart or not rows.hand:
-        return Stack(rows, f, f.R, L, by)
+        return Stack(rows, f, f.R, L, by, spared)
     top = np.vstack(hand) / f.scale
     f = replace(f, square=f.square + float(np.vdot(top, top)))
     if by is not None:
-        L = scipy.linalg.block_diag(*(np.linalg.cholesky(weight.hand) for weight in by[: rows.halves]), L)
-    return Stack(rows, f, np.vstack([top, f.R]), L, by)
+        L = scipy.linalg.block_diag(*(cholesky_of(comm, weight.hand) for weight in by[: rows.halves]), L)
+    return Stack(rows, f, np.vstack([top, f.R]), L, by, spared)
 
 
 def cholesky_of(comm: MPI.Intracomm, G: Array) -> Array:
