@@ -19,14 +19,13 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import softgrasp as sg
-from softgrasp.fem import pymor
+from softgrasp.fem import compiled, pymor
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.fields import vtu
 from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.simulate import Run
 from softgrasp.fem.scene.table import read_csv
 from softgrasp.fem.solve.cholesky import Dissection
-from softgrasp.fem.strain import compiled
 from softgrasp.lqr.dense import care
 from softgrasp.lqr.design import controller as controllers
 from softgrasp.lqr.design import feedback
@@ -283,7 +282,7 @@ def patterns(*_: Any) -> None:
 
 def dissected(*_: Any) -> None:
     own: Any = SimpleNamespace(order=SimpleNamespace(d=1), before=(np.array([0, 9, 9]), np.zeros(1)))
-    Dissection.matrix(own, matrix(E).convert("aij"))
+    Dissection.blocks(own, matrix(E).convert("aij"))
 
 
 WRONG_SHAPES: Any = SimpleNamespace(Z=np.zeros((3, 2)), q_s=np.zeros((2, 2)), v_s=np.zeros((2, 2)))

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from softgrasp.fem.compiled import LANES, cache_folder, library
 from softgrasp.fem.energy.program import Operations, Program
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.strain.compiled import LANES, cache_folder, library
 from softgrasp.fem.strain.laws import Start
 from softgrasp.fem.strain.points import QuadraturePoints, node_arrays
 

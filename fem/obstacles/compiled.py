@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.strain.compiled import library
+from softgrasp.fem.compiled import library
 
 SOURCE = Path(__file__).with_name("contact.c")
 HEADERS = tuple(SOURCE.with_name(name) for name in ("dense.h", "flat.h", "pivots.h", "rub.h", "swept.h", "triangle.h"))

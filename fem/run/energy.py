@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array, PETSc, rows_on_all
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
+from softgrasp.fem.solve.differences import address, product_code
 
-ENTRIES = 1 << 20  # of a matrix that are multiplied together, for little memory
+ENTRIES = 1 << 20  # of a matrix that NumPy multiplies together, for little memory
 
 
 def wide_product(A: PETSc.Mat, x: Array) -> NDArray[np.longdouble]:
-    """A x on this rank's rows for all rows of x, in the widest type of NumPy. Collective."""
-    first, last = A.getOwnershipRange()
-    most = max(1, int(A.getInfo()["nz_used"]) // ENTRIES)
-    parts, result = int(A.comm.tompi4py().allreduce(most, max)), np.zeros(last - first, np.longdouble)
-    every = PETSc.IS().createStride(len(x), 0, 1, comm=PETSc.COMM_SELF)
-    for part in np.array_split(np.arange(last - first), parts):
-        rows = PETSc.IS().createStride(len(part), first + (int(part[0]) if len(part) else 0), 1, comm=PETSc.COMM_SELF)
-        (some,) = A.createSubMatrices([rows], [every])
-        indptr, columns, values = some.getValuesCSR()
-        if len(values):
-            result[part] = np.add.reduceat(values.astype(np.longdouble) * x[columns], indptr[:-1])
-        some.destroy()
-        rows.destroy()
-    every.destroy()
+    """A x on this rank's rows for all rows of x, in the widest type of NumPy."""
+    result, code = np.zeros(A.getLocalSize()[0], np.longdouble), product_code()
+    if not x.any():
+        return result
+    first, columns, values = A.getValuesCSR()
+    if code is not None:
+        code.softgrasp_wide(len(result), *map(address, (first, columns, values, x, result)))
+        return result
+    every = np.append(np.arange(0, len(values), ENTRIES), len(values))
+    ends = np.unique(np.searchsorted(first, every))
+    for begin, end in itertools.pairwise(ends):
+        some = slice(first[begin], first[end])
+        terms = values[some].astype(np.longdouble) * x[columns[some]]
+        result[begin:end] = np.add.reduceat(terms, first[begin:end] - first[begin])
     return result
 
 

@@ -42,7 +42,7 @@ class Ledger:
         if self.taken is not None:
             self.taken[n, 0] = self.midpoint.dissipated
             if self.contact is not None:
-                self.taken[n, 1] = self.contact.table.energy[0]
+                self.taken[n, 1] = self.contact.table.energies[0]
 
     def start(self, state: TissueState) -> None:
         """Keep the energy of the first state. Collective."""
@@ -58,7 +58,7 @@ class Ledger:
     def balance(self, n: int) -> tuple[float, float]:
         """Work of loads and contact, and energy dissipated, from the start to step n, the last [J]. Collective."""
         work = self.midpoint.work(self.loads[:n], self.pulls[1 : n + 1])
-        contact = 0.0 if self.contact is None else float(self.contact.table.energy[0])
+        contact = 0.0 if self.contact is None else float(self.contact.table.energies[0])
         return self.midpoint.over_ranks(work) + contact, self.midpoint.over_ranks(self.midpoint.dissipated)
 
     def drift(self, state: TissueState, n: int) -> float:

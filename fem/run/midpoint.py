@@ -93,7 +93,7 @@ class TissueMidpoint:
         w: half the change of z in the step, z_mid - z_n, on the rows here [m]; ``w_array`` is its array.
         c: coefficients of the load of the step in work, (n_s,).
         pending: coefficients p of the load that r still lacks between steps, h = r + G p, (n_s,).
-        K2: -2 K, whose product one call adds to r.
+        K2: -2 K, whose product one call adds to r, see :mod:`softgrasp.fem.solve.differences`.
         k: K2 z, on the rows here [N]; carried from step to step where damping is on; ``k_array`` is its array.
         x: the rows of w that this rank owns, in the order of the state; w itself unless the vectors are whole here.
     """
@@ -115,8 +115,7 @@ class TissueMidpoint:
         ordered = solver == "cholesky" and whole
         self.operators = replicated_operators(system, midpoint_matrix(system, dt), whole, ordered, self._parts())
         self.G, self.rows = self.operators.G, self.operators.rows
-        self.K2 = self.operators.K
-        self.K2.scale(-2.0)
+        self.K2 = self.operators.K2
         with self.operators.raise_on_all_ranks():
             self.solver: TissueSolver = make_solver(
                 self.operators.S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible, ordered, not whole

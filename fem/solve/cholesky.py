@@ -54,15 +54,19 @@ class Dissection:
     after: tuple[NDArray[Any], NDArray[Any]]  # row pointers and columns of the blocks in this order
     source: NDArray[np.intp]  # earlier place of each block of ``after``
 
-    def matrix(self, A: PETSc.Mat) -> PETSc.Mat:
-        """A of the same pattern with rows and columns in this order, in blocks of d x d (BAIJ).
+    def blocks(self, A: PETSc.Mat) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+        """A of the same pattern with rows and columns in this order: row pointers, columns and blocks of d x d.
 
         Raises ValueError: A has another pattern.
         """
         blocks = to_scipy(A).tobsr((self.order.d, self.order.d))
         if not all(np.array_equal(a, b) for a, b in zip(self.before, (blocks.indptr, blocks.indices), strict=True)):
             raise ValueError("the matrix does not have the pattern that was dissected")
-        csr = (*self.after, blocks.data[self.source])
+        return (*self.after, blocks.data[self.source])
+
+    def matrix(self, A: PETSc.Mat) -> PETSc.Mat:
+        """The same as a matrix (BAIJ). Raises ValueError: A has another pattern."""
+        csr = self.blocks(A)
         result = PETSc.Mat().createBAIJ(A.getSize(), self.order.d, csr=csr, comm=PETSc.COMM_SELF)
         result.setOption(PETSc.Mat.Option.SPD, bool(A.isSymmetricKnown()[1]))
         return result

@@ -13,6 +13,7 @@ from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, rows_on_all, whole_copy
 from softgrasp.fem.solve.cholesky import NodeOrder, dissect
+from softgrasp.fem.solve.differences import Differences, minus_twice
 from softgrasp.fem.system import BlockSystem
 
 
@@ -24,8 +25,7 @@ class ReplicatedOperators:
     whole: bool  # whether all rows are here, on a communicator of this rank alone
     order: NodeOrder | None  # order of the rows here; None: that of the layout
     rows: slice | NDArray[np.intp]  # places of the owned rows among those here, (n_local,)
-    # stiffness, a copy [N/m], (rows here, n_e); on one rank in blocks of d x d: a quarter less memory traffic
-    K: PETSc.Mat
+    K2: Differences | PETSc.Mat  # -2 K [N/m], (rows here, n_e)
     G: Array  # coupling to the hand, (rows here, n_s) [kg, kg m]
     S: PETSc.Mat  # matrix of the step, owned by the solver that factors it, (rows here, n_e) [N/m]
     D: PETSc.Mat | None  # damping matrix of layers that differ in beta, (rows here, n_e) [N s/m]; else None
@@ -53,7 +53,7 @@ class ReplicatedOperators:
 
     def destroy(self) -> None:
         """Free what is not the system's own. Collective."""
-        self.K.destroy()
+        self.K2.destroy()
         if self.whole:
             for A in (self.D, self.M):
                 if A is not None:
@@ -73,25 +73,23 @@ def replicated_operators(
     beside = () if D is None else (D, system.M_ee)
     first, last = layout.start, layout.start + layout.n_local
     if not (whole or ordered):
-        K = system.K_ee.copy()
-        if K.comm.size == 1:  # the conversion of a parallel matrix destroys its source
-            K.convert("baij")
+        k2 = minus_twice(system.K_ee, layout.dimension)
         G, M = np.asfortranarray(system.G), None if D is None else system.M_ee
-        return ReplicatedOperators(layout, False, None, slice(0, layout.n_local), K, G, S, D, M, parts)
-    every = [whole_copy(A) for A in (system.K_ee, S, *beside, *parts)]
+        return ReplicatedOperators(layout, False, None, slice(0, layout.n_local), k2, G, S, D, M, parts)
+    K, *every = (whole_copy(A) for A in (system.K_ee, S, *beside, *parts))
     for A in (S, *parts):
         A.destroy()
     G, order = rows_on_all(layout.comm, system.G), None
     rows: slice | NDArray[np.intp] = slice(first, last)
-    if ordered:
-        dissection = dissect(every[0], layout.dimension)
+    dissection = dissect(K, layout.dimension) if ordered else None
+    k2 = minus_twice(K, layout.dimension, dissection)
+    K.destroy()
+    if dissection is not None:
         for i, A in enumerate(every):
             every[i] = dissection.matrix(A)
             A.destroy()
         order = dissection.order
         G, rows = order.enter(G), order.rows_of(first, last)
-    else:
-        every[0].convert("baij")
-    K, S, *rest = every
+    S, *rest = every
     D, M = rest[: len(beside)] or (None, None)
-    return ReplicatedOperators(layout, True, order, rows, K, np.asfortranarray(G), S, D, M, tuple(rest[len(beside) :]))
+    return ReplicatedOperators(layout, True, order, rows, k2, np.asfortranarray(G), S, D, M, tuple(rest[len(beside) :]))

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.compiled import LANES, library
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc
-from softgrasp.fem.strain.compiled import LANES, library
 from softgrasp.fem.strain.laws import LAWS, Start, double_dot, green, stretches
 from softgrasp.fem.strain.points import QuadraturePoints, node_arrays
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from softgrasp.fem.compiled import library
 from softgrasp.fem.obstacles.compiled import HEADERS, RIDGE
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.strain.compiled import library
 from softgrasp.reduction.bridges.flight import PASSES
 
 SOURCE = Path(__file__).with_name("step.c")

@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.compiled import LANES
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.strain.compiled import LANES
 from softgrasp.fem.strain.laws import LAWS, Start
 
 BLOCK = 1 << 20  # entries of H at a time

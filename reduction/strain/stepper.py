@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from softgrasp.fem.compiled import library
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.strain.compiled import library
 from softgrasp.fem.strain.laws import LAWS
 from softgrasp.reduction.strain.cells import Potential
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from softgrasp.fem.compiled import library
 from softgrasp.fem.frame.balance import MOST as CORRECTIONS
 from softgrasp.fem.frame.balance import ROUNDING, HandBalance
 from softgrasp.fem.obstacles.compiled import HEADERS, RIDGE
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.strain.compiled import library
 
 SOURCE = Path(__file__).with_name("free.c")
 FUNCTION = "int softgrasp_free(const Free *t);"

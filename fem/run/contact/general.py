@@ -357,7 +357,7 @@ class Contact:
 
     def record(self) -> ContactRecord:
         """The record of the run."""
-        table, (work, touch, stopped, rubbed) = self.table, self.table.energy.tolist()
+        table, (work, touch, stopped, rubbed) = self.table, self.table.energies.tolist()
         names = tuple(o.name for o in self.obstacles)
         return ContactRecord(
             names, table.force, table.impulse, table.gap, table.touching, work, touch, stopped, rubbed,
@@ -368,7 +368,7 @@ class Contact:
         """Record and sets of a restart file, see :class:`softgrasp.fem.run.states.checkpoint.RestartState`."""
         keys = self.responses.keys[: self.responses.count]
         parts: list[NDArray[Any]] = [
-            self.table.energy, np.array([self.fastest]), self.small.tally, keys.ravel(),
+            self.table.sums.ravel(), np.array([self.fastest]), self.small.tally, keys.ravel(),
             np.array(self.responses.blocks), self.strike.nodes(), *self._sets(),
         ]  # fmt: skip
         sizes = np.array([len(parts), *(len(part) for part in parts)])
@@ -384,7 +384,7 @@ class Contact:
         count = 1 + int(numbers[0])
         ends = np.cumsum(numbers[1:count].astype(int))
         energy, fastest, tally, keys, blocks, struck, *sets = np.split(numbers[count:], ends)[:-1]
-        self.table.energy[:], self.fastest, self.small.tally[:] = energy, float(fastest[0]), tally
+        self.table.sums[:], self.fastest, self.small.tally[:] = energy.reshape(2, 4), float(fastest[0]), tally
         self.responses.again([(int(i), int(k)) for i, k in keys.reshape(-1, 2)], blocks.astype(int).tolist())
         self.strike.restore(struck.astype(int))
         self._resume(sets)

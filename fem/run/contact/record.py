@@ -65,16 +65,31 @@ class Tables:
     touching: Array  # numbers of pressed nodes, (steps, obstacles)
     hand: Array  # force of the contact in the freedoms of the hand, impulses included, (steps, n_s) [N, N m]
     kick: Array  # G'u for the jump u of the velocity by each impulse, (steps, n_s) [N s, N m s]
-    energy: Array  # work, and energy dissipated at first touch, by impulses and by friction, (4,) [J]
+    energy: Array  # work, and energy dissipated at first touch, by impulses and by friction, in a step, (4,) [J]
+    sums: Array  # the same up to the step before, and what rounding of these sums lost, (2, 4) [J]
 
     @staticmethod
     def empty(steps: int, obstacles: int, d: int, n_s: int) -> Tables:
         """Room for all steps."""
         force, impulse = np.zeros((2, steps, obstacles, d))
         hand, kick = np.zeros((2, steps, n_s))
-        return Tables(
-            force, impulse, np.zeros((steps + 1, obstacles)), np.zeros((steps, obstacles)), hand, kick, np.zeros(4)
-        )
+        gap, touching = np.zeros((steps + 1, obstacles)), np.zeros((steps, obstacles))
+        return Tables(force, impulse, gap, touching, hand, kick, np.zeros(4), np.zeros((2, 4)))
+
+    def add(self) -> None:
+        """Add the energies of a step to the sums, by the sum of [Knuth97] that keeps what rounding loses."""
+        if not self.energy.any():
+            return
+        before, more = self.sums[0].copy(), self.energy
+        self.sums[0] += more
+        share = self.sums[0] - before
+        self.sums[1] += (before - (self.sums[0] - share)) + (more - share)
+        more[:] = 0.0
+
+    @property
+    def energies(self) -> Array:
+        """Work, and energy dissipated at first touch, by impulses and by friction, so far, (4,) [J]."""
+        return np.asarray(self.sums.sum(axis=0))
 
     def _tables(self) -> tuple[Array, ...]:
         return self.force, self.impulse, self.gap, self.touching, self.hand, self.kick

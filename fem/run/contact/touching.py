@@ -29,6 +29,7 @@ class Touching(TissueMidpoint):
         super().advance(old, new)
         if self.contact is not None:
             self.contact.finish(new)
+            self.contact.table.add()
 
     def load_size(self) -> float:
         """See :meth:`TissueMidpoint.load_size`: with the forces of obstacles, which may balance. Collective."""

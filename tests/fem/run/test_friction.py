@@ -234,7 +234,7 @@ def test_every_step_of_friction_takes_energy(monkeypatch: pytest.MonkeyPatch) ->
 
     def note(contact: FlatFriction, *arguments: Any) -> None:
         finish(contact, *arguments)
-        taken.append(float(contact.table.energy[3]))
+        taken.append(float(contact.table.energies[3]))
 
     monkeypatch.setattr(FlatFriction, "finish", note)
     run(BETA, SIDE, table(0.4))

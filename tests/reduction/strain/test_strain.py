@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from softgrasp.fem.compiled import library
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.strain.compiled import library
 from softgrasp.fem.strain.laws import LAWS, LawName
 from softgrasp.reduction.archive import load, save, write_checksums
 from softgrasp.reduction.bases.basis import ReductionError

@@ -1,8 +1,9 @@
-"""C beside this package, compiled when it is first needed, once for a machine, into $XDG_CACHE_HOME/softgrasp."""
+"""C of this package, compiled when it is first needed, once for a machine, into $XDG_CACHE_HOME/softgrasp."""
 
 from __future__ import annotations
 
 import atexit
+import ctypes
 import functools
 import hashlib
 import os
@@ -12,11 +13,12 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-LAWS = Path(__file__).parent  # of law.h, which every source includes
+LAWS = Path(__file__).with_name("strain")  # of law.h, which every source includes
 LANES = 8  # points that the C code treats at a time
 FLAGS = (f"-DLANES={LANES}", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 
@@ -34,20 +36,35 @@ def library(
         headers: files beside law.h that it includes.
         defined: macros, NAME=VALUE.
     """
-    try:
+
+    def load() -> Any:
         from cffi import FFI  # it comes with FFCx, not with every online machine
 
         path = _shared(source, headers, tuple(f"-D{macro}" for macro in defined))
         ffi = FFI()
         ffi.cdef(declaration)
         return ffi, ffi.dlopen(str(path))
+
+    return _or_warn(load, otherwise)
+
+
+@functools.cache
+def functions(source: Path, otherwise: str) -> Any:
+    """The functions of a C source by ctypes, which parses no declaration; see :func:`library`."""
+    return _or_warn(lambda: ctypes.CDLL(str(_shared(source, (), ()))), otherwise)
+
+
+def _or_warn(load: Callable[[], Any], otherwise: str) -> Any:
+    """What ``load`` returns; None, with a warning, where it cannot be compiled."""
+    try:
+        return load()
     except (ImportError, OSError, RuntimeError, subprocess.SubprocessError) as error:
         reason = (str(getattr(error, "stderr", "") or "") or str(error)).strip().splitlines()[:1]
         warnings.warn(
             f"{otherwise}, for want of compiled code ({''.join(reason)}); install cffi and a C compiler, or name one "
             "in CC",
             RuntimeWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
         return None
 

@@ -1,0 +1,68 @@
+/* Products with K whose terms cancel: by the differences of neighbours, and in long double. Blocks of d x d, row by
+   row; see fem/solve/differences.py and fem/run/energy.py. */
+#include <stddef.h>
+
+#define INLINE static inline __attribute__((always_inline)) /* so that d is a constant in all loops */
+
+/* y += K z for K = K': blocks of the nodes above the diagonal alone, and the sums R of the block rows. */
+INLINE void pairs_as(const int d, int nodes, const int *first, const int *col, const double *K, const double *R,
+                     const double *restrict z, double *restrict y) {
+  for (int i = 0; i < nodes; i++, R += d * d) {
+    double x[3], u[3], sum[3] = {0, 0, 0};
+    for (int a = 0; a < d; a++) x[a] = z[(size_t)i * d + a];
+    for (int a = 0; a < d; a++)
+      for (int b = 0; b < d; b++) sum[a] += R[a * d + b] * x[b];
+    for (int e = first[i]; e < first[i + 1]; e++, K += d * d) {
+      const double *from = z + (size_t)col[e] * d;
+      double *to = y + (size_t)col[e] * d, back[3] = {0, 0, 0};
+      for (int a = 0; a < d; a++) u[a] = from[a] - x[a];
+      for (int a = 0; a < d; a++)
+        for (int b = 0; b < d; b++) sum[a] += K[a * d + b] * u[b];
+      for (int a = 0; a < d; a++)
+        for (int b = 0; b < d; b++) back[b] += K[a * d + b] * u[a];
+      for (int a = 0; a < d; a++) to[a] -= back[a];
+    }
+    for (int a = 0; a < d; a++) y[(size_t)i * d + a] += sum[a];
+  }
+}
+
+/* y += the part of K z that comes from nodes of other ranks, whose displacements are in `ghost`. */
+INLINE void beside_as(const int d, int nodes, const int *first, const int *col, const double *K,
+                      const double *restrict ghost, const double *restrict z, double *restrict y) {
+  for (int i = 0; i < nodes; i++)
+    for (int e = first[i]; e < first[i + 1]; e++, K += d * d)
+      for (int a = 0; a < d; a++)
+        for (int b = 0; b < d; b++)
+          y[(size_t)i * d + a] += K[a * d + b] * (ghost[(size_t)col[e] * d + b] - z[(size_t)i * d + b]);
+}
+
+#define OF_BOTH(name, ...) (d == 2 ? name(2, __VA_ARGS__) : name(3, __VA_ARGS__))
+
+void softgrasp_pairs(int d, int nodes, const int *first, const int *col, const double *K, const double *R,
+                     const double *z, double *y) {
+  OF_BOTH(pairs_as, nodes, first, col, K, R, z, y);
+}
+
+void softgrasp_beside(int d, int nodes, const int *first, const int *col, const double *K, const double *ghost,
+                      const double *z, double *y) {
+  OF_BOTH(beside_as, nodes, first, col, K, ghost, z, y);
+}
+
+/* Sums R (nodes, d, d) of the blocks of each row. */
+void softgrasp_sums(int d, int nodes, const int *first, const double *K, double *R) {
+  for (int i = 0; i < nodes; i++, R += d * d) {
+    long double sum[9] = {0};
+    for (int e = first[i]; e < first[i + 1]; e++, K += d * d)
+      for (int c = 0; c < d * d; c++) sum[c] += K[c];
+    for (int c = 0; c < d * d; c++) R[c] = (double)sum[c];
+  }
+}
+
+/* y = A x for rows in single entries. */
+void softgrasp_wide(int rows, const int *first, const int *col, const double *A, const double *x, long double *y) {
+  for (int i = 0; i < rows; i++) {
+    long double sum = 0;
+    for (int e = first[i]; e < first[i + 1]; e++) sum += (long double)A[e] * x[col[e]];
+    y[i] = sum;
+  }
+}
