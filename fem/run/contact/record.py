@@ -66,7 +66,7 @@ class Tables:
     hand: Array  # force of the contact in the freedoms of the hand, impulses included, (steps, n_s) [N, N m]
     kick: Array  # G'u for the jump u of the velocity by each impulse, (steps, n_s) [N s, N m s]
     energy: Array  # work, and energy dissipated at first touch, by impulses and by friction, in a step, (4,) [J]
-    sums: Array  # the same up to the step before, and what rounding of these sums lost, (2, 4) [J]
+    sums: Array  # of ``energy`` over the steps, and what rounding of these sums lost, (2, 4) [J]
 
     @staticmethod
     def empty(steps: int, obstacles: int, d: int, n_s: int) -> Tables:
