@@ -7,8 +7,9 @@ and slip [AC91]: in 2D it is exact when the sets stay, in 3D the directions of s
 unknowns of its equations are forces of pressed nodes or, once factors have cost as much as W^-1, slips of slipping
 nodes, which are fewer; conjugate residuals [EES83] solve them from a factor of earlier sets, until a new one costs
 less. For many nodes factors and these steps are in single precision, unless this leads nowhere. Where the method comes
-back to sets seen before, sweeps of Gauss-Seidel find others; then pivots do (`lemke.py`), which in 2D end at a solution
-but for rounding, and in 3D lead to one by pyramids with edges nearer and nearer to the slips, or friction that grows.
+back to sets seen before, or moves the borders of wide sets node by node, a few sweeps of Gauss-Seidel find others from
+which it goes on. In 2D an interior point method follows (`interior.py`), then pivots (`lemke.py`), which end at a
+solution but for rounding; in 3D friction that grows, then pivots by pyramids with edges nearer and nearer to the slips.
 `friction.c` does so; without a compiler NumPy takes the same rounds (`newton.py`), each with a factor of its own.
 """
 
@@ -121,16 +122,15 @@ class Coulomb(Rounds):
             first: whether a step begins here: from forces that continue those of the last two steps.
             known: whether y is that of x already.
 
-        Raises SolverError: neither rounds nor sweeps find a solution, nor do pivots or friction that grows.
+        Raises SolverError: neither rounds nor sweeps find a solution, nor does what follows them.
         """
         if k != len(self.kind):
             self.fit(k)
         if not self._attempt(W, q, mu, tol, FIRST if first else OPENED, known):
-            others = (self._pivot, self._grow) if self.m == 1 else (self._grow, self._pivot)
+            others = (self._go_inside, self._pivot, self._grow) if self.m == 1 else (self._grow, self._pivot)
             if not any(other(W, q, mu, tol) for other in others):
                 raise SolverError(
-                    f"the friction of {k} nodes has no solution that {SWEEPS} sweeps find; raise time.steps, or use "
-                    "less friction"
+                    f"no solution was found for the friction of {k} nodes; raise time.steps, or use less friction"
                 )
         return self.x
 
@@ -143,6 +143,17 @@ class Coulomb(Rounds):
         found = self._in_numpy(W, q, mu, tol)
         self.y[:] = (W[: len(q), : len(q)] @ self.x.ravel() + q).reshape(self.y.shape)
         return found
+
+    def _go_inside(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
+        """Whether sets of an interior point method lead to a solution."""
+        from softgrasp.fem.obstacles.interior import interior_sets  # few runs need it
+
+        K = len(q)
+        if (found := interior_sets(W[:K, :K], q, mu)) is None:
+            return False
+        self.x[:], self.kind[:] = found
+        self.e[:, 0], self.e[:, 1] = np.where(self.x[:, 1] < 0, -1.0, 1.0), 0.0
+        return self._attempt(W, q, mu, tol)
 
     def _pivot(self, W: Array, q: Array, mu: Array, tol: float) -> bool:
         """Whether the law with pyramids, in 2D the law itself, leads to a solution."""
@@ -198,18 +209,20 @@ class Coulomb(Rounds):
             self._refuse()
             self.x[:], self.kind[:], self.e[:] = kept
             end = self._rounds(min(where, OPENED))
+        for sweeps in SWEEPS[self.m] if end != SOLVED else ():
+            self.code[1].softgrasp_sweep(self.f, sweeps, STILL)
+            kept = self.x.copy(), self.kind.copy(), self.e.copy()
+            self.f.rows = 0
+            if (end := self._rounds()) == SOLVED:
+                break
+        if end != SOLVED and self.f.single:  # in double precision from now on
+            self.x[:], self.kind[:], self.e[:] = kept
+            self._use(False)
+            self._matrices()
+            end = self._rounds()
         if end == SOLVED:
             return True
-        self.code[1].softgrasp_sweep(self.f, SWEEPS, STILL)
-        kept = self.x.copy(), self.kind.copy(), self.e.copy()
-        for single in (True, False) if self.f.single else (False,):
-            if self.f.single != single:  # from now on
-                self._use(single)
-                self._matrices()
-            self.f.rows = 0
-            if self._rounds() == SOLVED:
-                return True
-            self.x[:], self.kind[:], self.e[:] = kept
+        self.x[:], self.kind[:], self.e[:] = kept
         self.f.rows = 0
         return bool(self.code[1].softgrasp_wrong(self.f) <= tol)
 

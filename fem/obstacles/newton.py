@@ -11,8 +11,8 @@ from softgrasp.fem.obstacles.compiled import RIDGE
 
 Array = NDArray[Any]
 OPEN, STICK, SLIP = range(3)
-ROUNDS = 0, 40, 60  # of Newton's method, before and after the sweeps, by the number of tangents
-SWEEPS = 3000
+ROUNDS = 0, 40, 60  # of Newton's method, before and after sweeps, by the number of tangents
+SWEEPS = (), (3, 30), (3, 30, 300, 3000)  # between rounds, by tangents: few mend sets that are wrong at few nodes
 STILL = 1e-14  # change of the forces by a sweep over the largest, at which sweeps end
 NEARLY = 1e-9  # of a force, below which its node slips, or is open [1]
 
@@ -46,10 +46,11 @@ class Rounds:
         W = W[:K, :K]
         if self._newton(W, q, mu, tol):
             return True
-        self._sweep(W, q, mu)
-        kept = self.x.copy(), self.kind.copy(), self.e.copy()
-        if self._newton(W, q, mu, tol):
-            return True
+        for sweeps in SWEEPS[self.m]:
+            self._sweep(W, q, mu, sweeps)
+            kept = self.x.copy(), self.kind.copy(), self.e.copy()
+            if self._newton(W, q, mu, tol):
+                return True
         self.x[:], self.kind[:], self.e[:] = kept
         return self._wrong(W, q, mu) <= tol
 
@@ -127,13 +128,13 @@ class Rounds:
                     kind = STICK
             self.kind[i] = kind
 
-    def _sweep(self, W: Array, q: Array, mu: Array) -> None:
+    def _sweep(self, W: Array, q: Array, mu: Array, sweeps: int) -> None:
         """Projected Gauss-Seidel from the present normal forces on."""
         k, s = len(mu), 1 + self.m
         x = np.where(np.isfinite(self.x) & (self.x[:, :1] > 0), self.x, 0.0)
         w = W.diagonal().reshape(k, s)
         flat = x.ravel()
-        for _ in range(SWEEPS):
+        for _ in range(sweeps):
             self.tally[1] += 1
             before = x.copy()
             for i in range(k):

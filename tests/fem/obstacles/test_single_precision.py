@@ -22,6 +22,6 @@ def test_factors_in_single_precision_lead_to_forces_in_double(twice: bool) -> No
         moved = W @ coulomb.solve(k, W, load, mu, 1e-13).ravel()
         swept = Coulomb(2, "NumPy")
         swept.fit(k)
-        swept._sweep(W, load, mu)
+        swept._sweep(W, load, mu, 3000)
         assert np.abs(moved - W @ swept.x.ravel()).max() < 1e-10 * np.abs(moved).max()  # sweeps end at 1e-14
     assert twice or coulomb.f.single
