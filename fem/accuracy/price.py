@@ -15,6 +15,7 @@ from softgrasp.fem.accuracy.krylov import BLOCKS
 from softgrasp.fem.accuracy.surplus import ITERATIONS, MODES
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.run.forecast import forecast
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.costs import BUILD, ENTRIES, Work
 
 SHARE = 0.3  # of a run's work that an estimate may need without --certify
@@ -23,6 +24,7 @@ STARS = {2: 3e-5, 3: 1.2e-4, 4: 4e-4}  # [s] an unknown to set up stars, by orde
 STARS_ENTRY = 6.5e-9  # [s] of an entry in an iteration with them
 MOST_STARS = 1_200_000  # unknowns whose stars fit into the memory of a node
 COARSER = (0.8, 2 / 3, 0.5)  # cells a side of a box that is estimated instead, over those of the mesh
+MEETS = 1e-6  # distance of an end of the zone from a mesh line that is rounding, in cells [1]
 GRADED = {2: 0.3, 3: 0.9}  # [s] of graded meshes to compare with
 GRADED_FILE = {2: 0.3, 3: 3.5}  # the same of a mesh file, whose edges are bisected
 
@@ -58,11 +60,33 @@ def plans(model: Model) -> list[Plan]:
         result.append(Plan(_krylov(model, d, p, layout.n_e) + built + solves, surplus=True))
     if tissue.cells is not None and (tissue.refine is None or tissue.refine.tolerance is None):
         for ratio in COARSER:
-            cells = [max(math.ceil(ratio * n), 1) for n in tissue.cells]
+            cells = fewer_lines(model.scene, [max(math.ceil(ratio * n), 1) for n in tissue.cells])
             share = math.prod(cells) / math.prod(tissue.cells)
             if share < 1:
                 built = BUILD[d, p] * share * _cells(model)
                 result.append(Plan(_estimate_seconds(model, share) + built, cells=cells))
+    return result
+
+
+def fewer_lines(scene: Scene, most: list[int]) -> list[int]:
+    """Cells of a box, up to ``most`` along each edge, that meet the ends of the zone if the scene's own cells do.
+
+    On others the zone is a bit larger or smaller: of 4.1e5 unknowns in 2D the estimate was 0.6 or 2.0 instead of 1.1 %.
+    """
+    tissue, zone = scene.tissue, scene.contact.box
+    size, cells = tissue.size or [], tissue.cells or []
+    ends = [[0.0, 0.0] for _ in size]
+    if zone is not None:
+        origin = tissue.origin or [0.0] * len(size)
+        ends = [[(x - o) / w for x in pair] for *pair, o, w in zip(*zone, origin, size, strict=True)]
+
+    def meets(count: int, end: float) -> bool:
+        return not 0 < end < 1 or abs(count * end - round(count * end)) < MEETS
+
+    result = []
+    for n, last, pair in zip(cells, most, ends, strict=True):
+        met = [end for end in pair if meets(n, end)]
+        result.append(next((m for m in range(last, last // 2, -1) if all(meets(m, end) for end in met)), last))
     return result
 
 

@@ -21,6 +21,7 @@ from softgrasp.fem import (
     percent,
     spread,
 )
+from softgrasp.fem.accuracy.price import fewer_lines
 from softgrasp.fem.effects import EFFECTS, Gate
 from softgrasp.fem.effects.gate import SMALL_SHARE, Sag
 from softgrasp.fem.errors import MeshError, SceneError
@@ -58,10 +59,10 @@ if TYPE_CHECKING:  # plans are not imported where a scene asks for none
     from softgrasp.lqr.design.constrained import PlanSizes
 
 MODES = 6
-MOST_LOOKED_AT = {2: 20_000, 3: 6_000}  # unknowns that modes and sag are computed on
+MOST_LOOKED_AT = {2: 8_000, 3: 6_000}  # unknowns that modes, sag and estimate are computed on
 ESTIMATE_SECONDS = 0.5  # a dearer estimate of the mesh is left to simulate
 LARGE = 200_000  # cells beyond which rank 0 does not look for the ends
-BUILT_SECONDS = 0.5  # modelled time beyond which the sizes of a box are computed and nothing of it is assembled
+BUILT_SECONDS = 0.1  # modelled time beyond which the sizes of a box are computed and nothing of it is assembled
 
 
 @dataclass(frozen=True)
@@ -311,7 +312,7 @@ def _coarsened(scene: Scene, most: dict[int, int]) -> Scene:
     """The scene of a box on the cells of about so many unknowns, by dimension."""
     cells = scene.tissue.cells or []
     ratio = (most[len(cells)] / (len(cells) * _lattice(scene))) ** (1 / len(cells))
-    fewer = [max(int(ratio * n), 1) for n in cells]
+    fewer = fewer_lines(scene, [max(int(ratio * n), 1) for n in cells])
     return scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"cells": fewer})})
 
 
