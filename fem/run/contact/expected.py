@@ -29,9 +29,11 @@ MASS_BYTES = 20.0  # of such an entry; while it is made, both factors and one co
 # Ancestors of a node in nested dissection over the nodes of a cut, (nodes)^(1 - 1/d): 2.1 to 2.8 and 1.9 to 2.2 were
 # counted for nodes of the lower edge or face, with 400 to 20 200 and 441 to 6615 nodes [1].
 ANCESTORS = {2: 2.7, 3: 2.1}
-# Matrices over the rows: N S^-1 N' twice, its factor, N M^-1 N' and its factor; with friction both inverses too, all
-# four in single precision, and a factor of each problem of odd and of even steps [byte an entry].
-SQUARES = {False: 40.0, True: 88.0}
+# Matrices over the rows: N S^-1 N' twice, its factor, N M^-1 N' twice and its factor, and what making them takes;
+# with friction both inverses too, all four in single precision, and a factor of each problem of odd and of even steps.
+# Measured with 101 to 1089 rows, and 202 to 1323 with friction [byte an entry].
+SQUARES = {False: 72.0, True: 108.0}
+CODE = 10e6  # modules and compiled code of contact [byte]
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class ExpectedContact:
         """Memory over all ranks [byte] with n unknowns, of which ``copies`` are kept."""
         rows = ranks * self._ancestors(n) if self._swept(solver) else copies * n + ranks * self.surface
         mass = 8.0 * self.nodes * self._ancestors(n) / self.dimension + MASS_BYTES * self._fill(n)
-        return 8.0 * self.columns * rows + ranks * (mass + SQUARES[self.rubs] * self.columns**2)
+        return 8.0 * self.columns * rows + ranks * (CODE + mass + SQUARES[self.rubs] * self.columns**2)
 
     def seconds(self, n: int, solve: float, steps: int, factor: float, solver: SolverName) -> float:
         """Time of first touches and of all steps in contact [s], at most; solve: time of one with ``factor`` bytes [s].
