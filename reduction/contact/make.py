@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 PREFIX = "softgrasp_landing_"
 DEPENDENT = 1e-13  # least share of a direction of the basis in its Gram matrix, scaled [1]
 LANDING = 8.0  # s of the answer to a landing over the frequency of the highest mode; 2 to 32 do as well [1]
-CROWD = 1.6  # power of the distance from the end by which hat functions crowd there, where pressures are steep [1]
+# Power of the distance from the end by which hat functions crowd there, where pressures are steep; chosen on the
+# motions whose errors docs/guide gives [1].
+CROWD = 1.6
 
 
 def contact_model(model: Model, modes: int = 10, reach: float | None = None, rows: int | None = None) -> ContactModel:
