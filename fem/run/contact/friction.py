@@ -6,7 +6,9 @@ stops along its tangents too when the impulse y comes, as far as the impulse of 
 
     0 <= p_n,  v_n >= 0,  p_n v_n = 0,   |p_t| <= mu p_n,  p_t = -mu p_n v_t / |v_t| where v_t is not 0
 
-for the velocities v after it. So the mean force of a step obeys Coulomb's law with its impulses.
+for the velocities v after it; v_t of a node that slips in the step is that of the step, with what the impulse adds, so
+that where all is at rest but for rounding the impulse is rounding too. So the mean force of a step obeys Coulomb's law
+with its impulses.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles import HalfSpace
 from softgrasp.fem.obstacles.coulomb import Coulomb
 from softgrasp.fem.obstacles.inverse import Inverse
-from softgrasp.fem.obstacles.newton import OPEN, STICK
+from softgrasp.fem.obstacles.newton import OPEN, SLIP, STICK
 from softgrasp.fem.obstacles.obstacle import Obstacle
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.contact.flat import FlatContact
@@ -60,7 +62,7 @@ class RubbingRows(Rows):
 
 
 def rubbing_impulse(
-    contact: Contact, jolt: Coulomb, x: Array, rubbed: float, mu: Array, A: Array, v: Array, still: float
+    contact: Contact, jolt: Coulomb, x: Array, rubbed: float, mu: Array, A: Array, v: Array, mean: Array, still: float
 ) -> Array | None:
     """Impulse with friction (k d,) that stops rows; None where friction would not dissipate energy in the step.
 
@@ -71,14 +73,14 @@ def rubbing_impulse(
         mu: coefficients of friction, (k,).
         A: N M^-1 N' of the rows, a normal and then its tangents, (k d, k d).
         v: velocities along them, (k, d).
+        mean: the same, but of slipping nodes along their tangents those of the step, (k, d).
         still: velocity that is rounding [m/s].
     """
-    before = v.ravel()
     pushed = contact.dt * x
-    jolt.x[:], jolt.y[:] = pushed, v
-    q = before - dsymv(1.0, A.T, pushed.ravel())
+    jolt.x[:], jolt.y[:] = pushed, mean
+    q = mean.ravel() - dsymv(1.0, A.T, pushed.ravel())
     y = (jolt.solve(len(x), A, q, mu, still, known=True) - pushed).ravel()
-    taken = -y * (before + jolt.y.ravel()) / 2
+    taken = -y * (v + (jolt.y - mean) / 2).ravel()
     along = float(taken[:: v.shape[1]].sum())
     across = float(taken.sum()) - along
     if across - rubbed < 0:
@@ -162,7 +164,9 @@ class FrictionContact(Contact):
         self.jolt.fit(len(rows.node))
         self.jolt.kind[:], self.jolt.e[:] = rows.kind, rows.e
         x, rubbed = np.column_stack([rows.x, rows.x_t]), float(np.einsum("ka,ka->", rows.x_t, rows.slip))
-        y = rubbing_impulse(self, self.jolt, x, rubbed, self.mu[rows.obstacle], A, speed, still)
+        mean = speed.copy()
+        mean[rows.kind == SLIP, 1:] = rows.slip[rows.kind == SLIP] / self.dt
+        y = rubbing_impulse(self, self.jolt, x, rubbed, self.mu[rows.obstacle], A, speed, mean, still)
         if y is None:
             super()._halt(state, n, rows, normal, v, still)
             return
@@ -291,7 +295,9 @@ class FlatFriction(FlatContact):
             side.stop(on, self.stops.A, self.sides[1 - self.n % 2])
             side.jolt.kind[:], side.jolt.e[:] = side.coulomb.kind[nodes], side.coulomb.e[nodes]
         x, before, rubbed = self.x[on].reshape(-1, s), -self.rates[on].reshape(-1, s), self.c.softgrasp_rubbed(self.f)
-        y = rubbing_impulse(self, side.jolt, x, rubbed, self.friction[nodes], side.A, before, self.f.still)
+        mean, slips = before.copy(), side.coulomb.kind[nodes] == SLIP
+        mean[slips, 1:] = 2 / self.dt * side.coulomb.y[nodes[slips], 1:]
+        y = rubbing_impulse(self, side.jolt, x, rubbed, self.friction[nodes], side.A, before, mean, self.f.still)
         self.struck[:k] = 0.0
         if y is None:
             first = on[::s]
