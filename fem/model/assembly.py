@@ -27,6 +27,7 @@ from softgrasp.fem.model.contact import (
     rigid_modes,
 )
 from softgrasp.fem.model.patches import make_patches
+from softgrasp.fem.model.symmetric import symmetric_part
 from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.scene.scene import FiniteStrain, Scene
 from softgrasp.fem.system import Component, LayerBlocks
@@ -183,11 +184,11 @@ class Blocks:
             dx = ufl.Measure("dx", domain=self.domain, subdomain_data=[(1, self.cells[layer])])(1)
         return self.whole(form(dx))
 
-    def whole(self, form: Any) -> Component:
-        """The blocks of a bilinear form. Collective."""
+    def whole(self, form: Any, symmetric: bool = True) -> Component:
+        """The blocks of a bilinear form, of its symmetric part if it is known to be symmetric. Collective."""
         compiled = dolfinx.fem.form(form)
         self.csr = self.csr or dolfinx.fem.create_matrix(compiled)
-        return _component(self.space, _assembled(self.domain.comm, self.csr, compiled), self.thickness)
+        return _component(self.space, _assembled(self.domain.comm, self.csr, compiled, symmetric), self.thickness)
 
 
 def assemble(
@@ -213,7 +214,7 @@ def assemble(
     return tuple(result)
 
 
-def _assembled(comm: MPI.Intracomm, csr: Any, form: Any) -> PETSc.Mat:
+def _assembled(comm: MPI.Intracomm, csr: Any, form: Any, symmetric: bool) -> PETSc.Mat:
     """The form's matrix as PETSc AIJ, with the same bits in every run on the same number of ranks. Collective.
 
     PETSc adds what other ranks give to a row in the order their messages arrive; DOLFINx's own matrix adds it in the
@@ -227,6 +228,8 @@ def _assembled(comm: MPI.Intracomm, csr: Any, form: Any) -> PETSc.Mat:
     used = csr.indptr[n]
     numbers = columns.local_to_global(csr.indices[:used].astype(np.int32))
     blocks = csr.data[: used * d * d].reshape(-1, d, d)
+    if symmetric:
+        blocks = symmetric_part(comm, rows.local_range[0], csr.indptr[: n + 1], numbers, blocks)
     A = scipy.sparse.bsr_matrix((blocks, numbers, csr.indptr[: n + 1]), shape=(n * d, columns.size_global * d)).tocsr()
     A.sort_indices()
     size = ((n * d, rows.size_global * d), (columns.size_local * d, columns.size_global * d))

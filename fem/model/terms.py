@@ -146,7 +146,7 @@ def _row(
         load = _load(space, compiled, thickness, T)
         size = math.sqrt(total(comm, np.array([load[0] @ load[0]]))[0] + load[1] @ load[1])
     else:
-        own = blocks.whole(form)
+        own = blocks.whole(form, symmetric=False)  # which is asked below
         size = own.ee.norm(PETSc.NormType.FROBENIUS)
     if not 0 < size < math.inf:
         raise SceneError(

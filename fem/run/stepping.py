@@ -13,6 +13,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.states.snapshots import NoStore
+from softgrasp.fem.run.velocity import EVERY, restore_velocity
 from softgrasp.fem.solve.solvers import SolverUsed
 
 
@@ -29,6 +30,7 @@ class Stepped(ABC):
 
     Attributes:
         state: state [z; v_z] of the tissue at the step ``reached`` [m; m/s].
+        linear: whether the steps carry M v of a linear tissue.
         reached: number of the last step done [1].
         seconds: time of all steps by :meth:`advance_to`, without the checks [s].
         counted: number of these steps [1].
@@ -49,6 +51,7 @@ class Stepped(ABC):
         self.layout, self.dt, self.steps = layout, dt, steps
         self.midpoint, self.store, self.solver = midpoint, store, solver
         self.state: TissueState = store.target(0)
+        self.linear = midpoint.system.points is None and midpoint.system.frame is None
         self.reached = 0
         self.seconds, self.checking, self.counted = 0.0, 0.0, 0
         self.check_at, self.residual = -1, 0.0
@@ -71,6 +74,8 @@ class Stepped(ABC):
             self.checking += time.perf_counter() - begin
         new = self.store.target(n + 1)
         self.midpoint.advance(self.state, new)
+        if (n + 1) % EVERY == 0 and self.linear:
+            restore_velocity(self.midpoint, new)
         self.state = new
         self.reached = n + 1
         self.record(n + 1)

@@ -1,0 +1,70 @@
+"""The balance of energy on bodies whose stiffness loses digits: flat cells, nu near 0.5, layers, bounces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import build
+from softgrasp.fem.petsc import rows_on_all
+from softgrasp.fem.run.energy import wide_product
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.solve.differences import minus_twice
+from tests.hardcases.contact import BODY, RUN, TABLE, vibrating
+from tests.helpers.models import gather_matrix
+
+STIFF = "tissue.layers={stiff={box=[[0, 0], [1, 0.5]], material={young=1.25e6, poisson=0.3, rho=1.0}}}"
+HARD = ("tissue.order=2", "tissue.material={young=125.0, poisson=0.499, rho=1.0}")
+LANDS = (*BODY, *RUN, f"obstacle=[{TABLE}]")
+CASES = {
+    "layers 1e4 apart": ("paper_forward", *LANDS, STIFF),  # 1.6e-12 by K's own product
+    "nu = 0.499": ("paper_forward", *LANDS, *HARD),  # 1.4e-13 by a K that is not symmetric in its bits
+    "flat cells": ("paper_forward", "tissue.cells=[200, 3]", "time.steps=100"),  # 3.7e-13 by K's own product
+    "flat cells against a disc": ("push_disc", "tissue.cells=[300, 3]"),  # 4.9e-13
+}
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("name", CASES)
+def test_balance_closes_where_the_stiffness_loses_digits(name: str) -> None:
+    scene, *changes = CASES[name]
+    assert simulate(build(scene, changes)).energy_drift < 1e-13  # of issue 28; measured 2e-15 to 7e-14
+
+
+@pytest.mark.serial
+def test_a_thousand_bounces_do_not_add_up(tmp_path: Path) -> None:
+    """Impulses stop the velocity that belongs to the momentum, and sums of work keep what their rounding loses."""
+    drift = simulate(build("paper_forward", [*BODY, *vibrating(tmp_path, 1000)])).energy_drift
+    assert drift < 1e-14  # measured 4e-16; 8e-14 before
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("order", [1, 2])
+def test_stiffness_is_symmetric_in_its_bits(comm: MPI.Intracomm, order: int) -> None:
+    system = build("paper_forward", ["tissue.cells=[5, 8]", f"tissue.order={order}"], comm=comm).system
+    for A in (system.K_ee, system.M_ee):
+        whole = gather_matrix(system.layout, A)
+        assert abs(whole - whole.T).max() == 0
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize(("scene", "cells"), [("paper_forward", "[60, 2]"), ("set_down_3d", "[20, 20, 2]")])
+def test_differences_lose_no_digits_on_flat_cells(comm: MPI.Intracomm, scene: str, cells: str) -> None:
+    """A quadratic field, whose K z is small against the entries of K, against extended precision."""
+    system = build(scene, [f"tissue.cells={cells}"], comm=comm).system
+    K, x = system.K_ee, system.layout.nodes
+    z, y = K.createVecs()
+    z.array_w[:] = (x * x[:, ::-1] + 0.3).ravel()
+    exact = -2 * wide_product(K, rows_on_all(comm, z.array_r))
+    errors = []
+    product = minus_twice(K, system.layout.dimension)
+    for multiply, factor in ((product.mult, 1), (K.mult, -2)):
+        multiply(z, y)
+        errors.append(comm.allreduce(float(np.abs(factor * y.array_r - exact).max(initial=0.0)), MPI.MAX))
+    scale = comm.allreduce(float(np.abs(exact).max(initial=0.0)), MPI.MAX)
+    assert errors[0] < 1e-13 * scale  # the differences of neighbours keep 13 digits of z here
+    assert errors[0] < errors[1] / 3  # K's own product loses more
+    product.destroy()
