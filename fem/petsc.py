@@ -104,12 +104,15 @@ def to_scipy(A: PETSc.Mat) -> Any:
 
 
 def combine(terms: list[tuple[float, PETSc.Mat]]) -> PETSc.Mat:
-    """Return sum_i a_i A_i for matrices of one pattern, as a new matrix. Collective."""
+    """Return sum_i a_i A_i for matrices of one pattern, a new matrix, symmetric in its bits if all are. Collective."""
     factor, first = terms[0]
     result = first.copy()
     result.scale(factor)
     for factor, term in terms[1:]:
-        result.axpy(factor, term, SAME)
+        scaled = term.copy()
+        scaled.scale(factor)  # a y + x in one call is rounded once or twice, by the place of an entry in its array
+        result.axpy(1.0, scaled, SAME)
+        scaled.destroy()
     return result
 
 
