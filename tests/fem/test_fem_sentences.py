@@ -319,7 +319,7 @@ SENTENCES: list[tuple[Act, str]] = [
     (term(lambda u, v: 1e300 * ufl.inner(u, v) * ufl.ds, 1e300), "the term bed adds no finite number to the "),
     (term(lambda u, v: u[0] * v[1] * ufl.ds), "the term bed is not symmetric in u and v; a spring has an energy"),
     (term(lambda u, v: v[0] * ufl.ds), "the term bed must be a bilinear form in u and v on cells (dx) or the boundary"),
-    (unbounded, "the friction of 1 nodes has no solution that "),
+    (unbounded, "no solution was found for the friction of 1 nodes"),
     (no_contact_in_c, "compiled contact is not available here; leave the engine out"),
     (at_rest(ReducedSystem(E, -E, np.zeros((2, 1)), E, np.zeros(2), np.zeros((1, 2)), np.zeros((1, 2)))),
      "the reduced plant has no unique state of rest for a position of the hand"),
