@@ -1,6 +1,6 @@
-"""Compile the forms of P1 to P4 in 2D and 3D, so that no first run waits for them: `python tools/compile_forms.py`.
+"""Compile what a first run would wait for, forms of P1 to P4 and products of a step: `python tools/compile_forms.py`.
 
-They depend on dimension, order and whether there are layers, on nothing else; P3 is compared with P4 on its mesh.
+The forms depend on dimension, order and whether there are layers, on nothing else; P3 is compared with P4 on its mesh.
 """
 
 from __future__ import annotations
@@ -33,6 +33,9 @@ def compile_forms(job: tuple[int, int, bool]) -> None:
 
 def main() -> None:
     """Two at a time, each in a process of its own that ends with its work."""
+    from softgrasp.fem.solve.differences import product_code
+
+    product_code()
     jobs = list(product((2, 3), (1, 2, 3, 4), (False, True)))
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         list(pool.map(compile_forms, sorted(jobs, key=lambda job: (job[2], job[0], job[1]))))
