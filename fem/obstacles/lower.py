@@ -27,7 +27,7 @@ WASTE = 16
 
 
 class LowerFactor:
-    """L with ones on its diagonal, as elimination leaves it: rows of a column below the next one are rows of that too.
+    """L with ones on its diagonal, as elimination leaves it: rows of a column are rows of its first one below too.
 
     Args:
         L: factor, (n, n).
@@ -40,24 +40,23 @@ class LowerFactor:
         ptr, rows, n = below.indptr, below.indices, L.shape[0]
         begin = _blocks(ptr, rows)
         sizes = np.diff(begin)
-        last = begin[1:] - 1  # column of each block, whose rows are those of the block
-        count = np.diff(ptr)[last]
+        of = np.repeat(np.arange(len(sizes)), sizes)[np.repeat(np.arange(n), np.diff(ptr))]
+        inside = rows < begin[of + 1]
+        # the rows of all columns of a block: SuperLU leaves out entries that cancel, in the last column too
+        keys, of_key = np.unique(of[~inside] * n + rows[~inside], return_inverse=True)
+        block, beneath = np.divmod(keys, n)
+        count = np.bincount(block, minlength=len(sizes))
         first = np.concatenate([[0], np.cumsum(count)])
-        of_last = np.repeat(ptr[last] - first[:-1], count) + np.arange(first[-1])
-        beneath, block = rows[of_last], np.repeat(np.arange(len(sizes)), sizes)
         width, height = -(-sizes // GROUP) * GROUP, -(-count // GROUP) * GROUP
         ends = np.cumsum(sizes * (width + height))
         at = ends - sizes * (width + height)
         column = np.repeat(np.arange(n), np.diff(ptr))
-        of = block[column]
-        inside = rows < begin[of + 1]
-        keys = np.repeat(np.arange(len(sizes)), count) * n + beneath
-        place = np.searchsorted(keys, of * n + rows) - first[of] + width[of]
-        place = np.where(inside, rows - begin[of], place)
+        place = rows - begin[of]
+        place[~inside] = of_key - first[of[~inside]] + width[of[~inside]]
         values = np.zeros(int(ends[-1]))
         values[at[of] + (column - begin[of]) * (width + height)[of] + place] = below.data
         self.f, self.f.count = self.ffi.new("Lower *"), len(sizes)
-        self.arrays = {
+        self.arrays: dict[str, Array] = {
             "begin": begin.astype(np.intc), "first": first.astype(np.intc), "rows": beneath.astype(np.intc),
             "at": at.astype(np.int64), "values": values, "room": np.zeros(int(height.max())),
         }  # fmt: skip
