@@ -17,16 +17,16 @@ class DistributedRows:
     """A X with a copy of this rank's rows of A: rows of X travel while each rank multiplies with its own. Collective.
 
     Attributes:
-        own: entries in the columns of this rank, (n_local, n_local).
+        own: entries in the columns of this rank, (n_local, m_local).
         other: entries in those of other ranks, (k, ghosts), in the k rows that have any.
         sent: local rows of X that other ranks need, by rank.
     """
 
     def __init__(self, A: PETSc.Mat) -> None:
         self.comm: MPI.Intracomm = A.comm.tompi4py()
-        (first, last), ranges = A.getOwnershipRange(), A.getOwnershipRanges()
+        (first, last), ranges = A.getOwnershipRangeColumn(), A.getOwnershipRangesColumn()
         indptr, columns, values = A.getValuesCSR()
-        rows = scipy.sparse.csr_matrix((values, columns, indptr), shape=(last - first, A.getSize()[1]))
+        rows = scipy.sparse.csr_matrix((values, columns, indptr), shape=(A.getLocalSize()[0], A.getSize()[1]))
         self.own = rows[:, first:last]
         ghosts = np.unique(columns[(columns < first) | (columns >= last)])
         other = rows[:, ghosts]
@@ -40,7 +40,7 @@ class DistributedRows:
         self.sent -= first
 
     def times(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Local rows of A X for local rows of X, (n_local, k). Collective."""
+        """Local rows of A X, (n_local, k), for local rows of X, (m_local, k). Collective."""
         k = X.shape[1]
         found = np.empty((int(self.coming.sum()), k))
         messages = self.comm.Ialltoallv([np.ascontiguousarray(X[self.sent]), self.going * k], [found, self.coming * k])

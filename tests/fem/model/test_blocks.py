@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from softgrasp.fem import petsc
 from softgrasp.fem.model.build import build
-from softgrasp.fem.petsc import times_columns
+from softgrasp.fem.petsc import PETSc, times_columns
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from tests.helpers.models import (
     CUBE,
@@ -69,6 +69,22 @@ def test_products_with_columns_equal_scipy(
         whole = scipy.sparse.csr_matrix((values, indices, rows), shape=(layout.n_local, layout.n_e)) @ X
         product = times_columns(system.K_ee, local)
         np.testing.assert_allclose(product, whole, rtol=0, atol=EXACT * np.abs(whole).max())
+
+
+@pytest.mark.ranks
+def test_products_of_more_rows_than_columns_equal_numpy(comm: MPI.Intracomm) -> None:
+    """As gradients at quadrature points; rank r has 11 + r rows and 4 + r columns."""
+    rng, rank, size = np.random.default_rng(5), comm.rank, comm.size
+    rows, columns = [11 + r for r in range(size)], [4 + r for r in range(size)]
+    whole, X = rng.standard_normal((sum(rows), sum(columns))), rng.standard_normal((sum(columns), 30))
+    row, column = sum(rows[:rank]), sum(columns[:rank])
+    A = PETSc.Mat().createAIJ(((rows[rank], None), (columns[rank], None)), nnz=whole.shape[1], comm=comm)
+    mine = np.arange(row, row + rows[rank], dtype=PETSc.IntType)
+    A.setValues(mine, np.arange(whole.shape[1], dtype=PETSc.IntType), whole[mine])
+    A.assemble()
+    product = times_columns(A, X[column : column + columns[rank]])
+    np.testing.assert_allclose(product, whole[mine] @ X, rtol=0, atol=EXACT * np.abs(whole @ X).max())
+    A.destroy()
 
 
 @pytest.mark.ranks
