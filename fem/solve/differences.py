@@ -74,7 +74,7 @@ class Differences:
         above.columns.__isub__(np.intc(begin))
         self._pairs = code.softgrasp_pairs
         self._arguments = (d, nodes, *map(address, (above.first, above.columns, above.values, sums)))
-        self._kept: list[Any] = [above, beside, sums]
+        self.above, self.beside, self.sums = above, beside, sums
         # last vectors and where they begin, which stays for their lives: a small step has no time to look it up
         self._z = self._y = like
         self._from = self._to = address(like.array_r)
@@ -93,7 +93,7 @@ class Differences:
         self._beside = code.softgrasp_beside
         arrays = beside.first, columns, beside.values, self.ghosts.array_w
         self._of_ghosts = (d, nodes, *map(address, arrays))
-        self._kept += arrays
+        self._kept = arrays  # addresses of which are in the arguments
 
     def createVecLeft(self) -> PETSc.Vec:  # noqa: N802 - of PETSc
         """A vector of the rows here."""

@@ -21,6 +21,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem import ITERATIVE, Array, Model, PETSc, Run, RunOptions, Scene, TissueMesh, build, digest
+from softgrasp.fem.solve.differences import Differences
 from softgrasp.study.effects.result import Cost, ZeroCostCheck
 from softgrasp.study.effects.switch import neutral
 from softgrasp.study.shell import RepeatableRun, interleave, medians, rotated
@@ -97,11 +98,23 @@ def memory_by_object(model: Model, run: Run) -> dict[str, float]:
     if contact is not None:
         holders += [("contact.", at) for at in (contact, contact.responses, contact.small, contact.table)]
         holders.append(("contact.surface.", contact.surface))
+        holders.append(("contact.", getattr(contact.responses, "swept", None)))
+        mass = getattr(getattr(contact.strike, "impulses", None), "mass", None)
+        holders += [("contact.mass.", mass), ("contact.mass.kept.", getattr(mass, "kept", None))]
+        holders.append(("contact.mass.", getattr(getattr(mass, "L", None), "arrays", None)))
     holders += [("step.", midpoint.operators), ("step.order.", midpoint.operators.order)]
     holders += [("points.", system.points), ("points.", getattr(midpoint, "body", None))]
     for layer in system.layers:
         holders += [(f"{key}[{layer.name}].", getattr(layer, key)) for key in ("K_mu", "K_lambda", "M_1")]
-    held = [(prefix + name, v) for prefix, at in holders if at is not None for name, v in vars(at).items()]
+    product = getattr(midpoint, "K2", None)
+    if isinstance(product, Differences):
+        holders += [("step.K2.", {"sums": product.sums}), ("step.K2.above.", product.above)]
+        holders.append(("step.K2.beside.", product.beside))
+    held = [
+        (prefix + name, value)
+        for prefix, at in holders if at is not None
+        for name, value in (at if isinstance(at, dict) else vars(at)).items()
+    ]  # fmt: skip
     seen: set[int] = set()
     sizes: dict[str, float] = {}
 

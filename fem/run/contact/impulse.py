@@ -32,12 +32,13 @@ class Impulses:
         system: of the run.
         surface: its boundary.
         free: whether the hand feels them.
+        order: nodes in the order of elimination, where the step has one.
 
     Attributes:
         starts: M^-1 G on the boundary, (p d, n_s).
     """
 
-    def __init__(self, system: BlockSystem, surface: Surface, free: bool) -> None:
+    def __init__(self, system: BlockSystem, surface: Surface, free: bool, order: Ints | None = None) -> None:
         layout, (_, d) = system.layout, surface.X.shape
         self.d, self.surface, self.numbers = d, surface, surface.dofs[::d] // d
         M = system.M_ee if layout.comm.size == 1 else whole_copy(system.M_ee)
@@ -47,7 +48,8 @@ class Impulses:
         if one.shape[0] > FACTORED[d] or (code := contact_library()) is None:
             self.mass = NodalMass(one, d)
         else:
-            self.mass = SweptMass(one, d, nested_dissection(one.indptr, one.indices), code)
+            order = nested_dissection(one.indptr, one.indices) if order is None else order
+            self.mass = SweptMass(one, d, order, code)
         first, self.n, self.n_s = layout.start // d, layout.n_local, layout.n_s if free else 0
         self.places = self.mass.places[first : first + self.n // d]  # of the nodes here in a jump
         self.X, self.H = np.zeros((layout.n_local, 0)), np.zeros((0, 0))

@@ -34,7 +34,8 @@ class Strike:
     def reactions(self) -> Impulses:
         """What impulses do, made when the first node is to stop. Collective."""
         if self.impulses is None:
-            self.impulses = Impulses(self.system, self.surface, self.free)
+            order = self.midpoint.operators.order
+            self.impulses = Impulses(self.system, self.surface, self.free, None if order is None else order.nodes)
         return self.impulses
 
     def nodes(self) -> Ints:

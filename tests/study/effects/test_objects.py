@@ -10,6 +10,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.model.build import build
+from softgrasp.fem.obstacles.mass import SweptMass
+from softgrasp.fem.obstacles.swept import SweptResponses
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.study.effects.measure import counting, difference, memory_by_object, objects_of
@@ -70,7 +72,13 @@ def test_a_step_in_contact_makes_no_object_and_its_memory_counts(comm: MPI.Intra
     assert contact is not None
     assert contact.table.touching[:11].sum() > 1  # contact in more than one of the steps that are counted
     assert contact.table.impulse[1:11].any()
-    assert memory_by_object(stepper.run.model, stepper.run)["contact.values"] == contact.responses.values.nbytes
+    sizes, mass = memory_by_object(stepper.run.model, stepper.run), contact.strike.reactions().mass
+    assert isinstance(mass, SweptMass)
+    assert isinstance(contact.responses, SweptResponses)
+    assert sizes["contact.values"] == contact.responses.swept.values.nbytes
+    assert sizes["contact.mass.values"] == mass.L.arrays["values"].nbytes
+    assert sizes["contact.mass.kept.values"] == mass.kept.values.nbytes
+    assert sizes["step.K2.above.values"] == stepper.run.midpoint.K2.above.values.nbytes
     stepper.destroy()
     at_first, in_steps = objects_of(comm, scene)
     assert in_steps == {}
