@@ -21,6 +21,9 @@ def wide_product(A: PETSc.Mat, x: Array) -> NDArray[np.longdouble]:
         return result
     first, columns, values = A.getValuesCSR()
     if code is not None:
+        first, columns = (
+            numbers.astype(np.intc, copy=False) for numbers in (first, columns)
+        )  # PETSc's may have 64 bits
         code.softgrasp_wide(len(result), *map(address, (first, columns, values, x, result)))
         return result
     every = np.append(np.arange(0, len(values), ENTRIES), len(values))

@@ -75,7 +75,8 @@ class Differences:
         self._pairs = code.softgrasp_pairs
         self._arguments = (d, nodes, *map(address, (above.first, above.columns, above.values, sums)))
         self.above, self.beside, self.sums = above, beside, sums
-        # last vectors and where they begin, which stays for their lives: a small step has no time to look it up
+        # last vectors and where they begin, which a small step has no time to look up; it stays for their lives, as
+        # nothing here calls placeArray
         self._z = self._y = like
         self._from = self._to = address(like.array_r)
         self.ghosts: PETSc.Vec | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import scipy.sparse.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
+from softgrasp.fem.run import energy
 from softgrasp.fem.run.energy import exact_energy
 from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.run.stepping import make_ts
@@ -29,6 +31,21 @@ def product(A: scipy.sparse.csr_matrix, x: list[Fraction], y: list[Fraction]) ->
     """x'A y."""
     A = A.tocoo()
     return sum((x[i] * Fraction(float(a)) * y[j] for i, j, a in zip(A.row, A.col, A.data, strict=True)), Fraction(0))
+
+
+@pytest.mark.serial
+def test_products_accept_indices_of_64_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a PETSc may have them, with C and without."""
+    csr = scipy.sparse.random_array((30, 30), density=0.2, format="csr", rng=np.random.default_rng(2))
+    csr = (csr + scipy.sparse.eye_array(30)).tocsr()
+    A = SimpleNamespace(
+        getLocalSize=lambda: (30, 30),
+        getValuesCSR=lambda: (csr.indptr.astype(np.int64), csr.indices.astype(np.int64), csr.data),
+    )
+    x = np.arange(1.0, 31.0)
+    for code in (energy.product_code(), None):
+        monkeypatch.setattr(energy, "product_code", lambda code=code: code)
+        np.testing.assert_allclose(energy.wide_product(A, x).astype(float), csr @ x, rtol=1e-14)  # sums of 30 terms
 
 
 @pytest.mark.skipif(np.finfo(np.longdouble).nmant < 60, reason="NumPy has no type wider than double here")

@@ -57,7 +57,7 @@ def test_petsc_counts_no_object_made_in_a_step(comm: MPI.Intracomm) -> None:
     everything = GRAVITY | RAYLEIGH | {"reaction": True, "rotation": True}
     for effects in ({}, everything):
         short, long = (
-            objects_of_a_run(comm, effects=effects, output={"snapshots": "none"}, time={"steps": n}) for n in (30, 60)
+            objects_of_a_run(comm, effects=effects, output={"snapshots": "none"}, time={"steps": n}) for n in (150, 300)
         )
         assert short == long
 
