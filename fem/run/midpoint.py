@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import numpy as np
 
 from softgrasp.fem.petsc import SAME, Array, PETSc, combine, total
-from softgrasp.fem.run.velocity import VelocityOfMomentum
 from softgrasp.fem.solve.replicated import replicated_operators
 from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
 from softgrasp.fem.system import BlockSystem, dynamic_stiffness
@@ -134,7 +133,8 @@ class TissueMidpoint:
             self._move = self._move_whole
         self.x_array: Array = self.x.array_w
         self._pick = self._picker()
-        self.dissipated, self.velocity = 0.0, VelocityOfMomentum()
+        self.dissipated = 0.0
+        self.spare: list[PETSc.Vec] = []  # of velocity.py, made once a run
         self._prepare()
 
     def _parts(self) -> tuple[PETSc.Mat, ...]:
@@ -392,7 +392,8 @@ class TissueMidpoint:
         """Free all PETSc objects. Collective."""
         self.solver.destroy()
         self.operators.destroy()
-        self.velocity.destroy()
+        for vector in self.spare:
+            vector.destroy()
         for name in ("r", "k", "x", "w", "r_here", "w_here", "added", "moved", "coupling", "k_old", "y", "z", "D"):
             if hasattr(self, name):
                 getattr(self, name).destroy()

@@ -13,7 +13,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.states.snapshots import NoStore
-from softgrasp.fem.run.velocity import EVERY
+from softgrasp.fem.run.velocity import EVERY, restore_velocity
 from softgrasp.fem.solve.solvers import SolverUsed
 
 
@@ -75,7 +75,7 @@ class Stepped(ABC):
         new = self.store.target(n + 1)
         self.midpoint.advance(self.state, new)
         if (n + 1) % EVERY == 0 and self.linear:
-            self.midpoint.velocity.restore(self.midpoint, new)
+            restore_velocity(self.midpoint, new)
         self.state = new
         self.reached = n + 1
         self.record(n + 1)

@@ -7,51 +7,34 @@ of contact stops v, not M^-1 pi, and its work would be wrong by e'dv.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from softgrasp.fem.petsc import PETSc
-
-if TYPE_CHECKING:
-    from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
+from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 
 EVERY = 128  # steps from one time to the next: a tenth of the time of a product a step
 ROUNDS = 8  # of conjugate gradients, which leave 1e-4 (linear elements) to 1e-2 of e
 
 
-class VelocityOfMomentum:
-    """Conjugate gradients for M v = pi. Its vectors are made when they are first needed, and kept for a run."""
-
-    def __init__(self) -> None:
-        self.vectors: tuple[PETSc.Vec, ...] = ()
-
-    def restore(self, midpoint: TissueMidpoint, state: TissueState) -> None:
-        """Set v = M^-1 pi up to a small share of what it was wrong by, for a step that is done. Collective."""
-        M, rows = midpoint.system.M_ee, midpoint.operators.rows
-        if not self.vectors:
-            inverse = M.getDiagonal()
-            inverse.reciprocal()
-            self.vectors = inverse, *(inverse.duplicate() for _ in range(4))
-        inverse, r, q, y, p = self.vectors
-        midpoint.adopt(state)  # sets -2 (K z - f)
-        h = midpoint.r_array[rows] + midpoint.G[rows] @ midpoint.pending
-        M.mult(state.v, q)
-        r.array_w[:] = (h - midpoint.k_array[rows] / 2) / midpoint.s - q.array_r
+def restore_velocity(midpoint: TissueMidpoint, state: TissueState) -> None:
+    """Set v = M^-1 pi up to a small share of what it was wrong by, for a step that is done. Collective."""
+    M, rows = midpoint.system.M_ee, midpoint.operators.rows
+    if not midpoint.spare:
+        inverse = M.getDiagonal()
+        inverse.reciprocal()
+        midpoint.spare = [inverse, *(inverse.duplicate() for _ in range(4))]
+    inverse, r, q, y, p = midpoint.spare
+    midpoint.adopt(state)  # sets -2 (K z - f)
+    h = midpoint.r_array[rows] + midpoint.G[rows] @ midpoint.pending
+    M.mult(state.v, q)
+    r.array_w[:] = (h - midpoint.k_array[rows] / 2) / midpoint.s - q.array_r
+    y.pointwiseMult(inverse, r)
+    y.copy(p)
+    rho = r.dot(y)
+    for _ in range(ROUNDS):
+        if not rho > 0:
+            break
+        M.mult(p, q)
+        step = rho / p.dot(q)
+        state.v.axpy(step, p)
+        r.axpy(-step, q)
         y.pointwiseMult(inverse, r)
-        y.copy(p)
-        rho = r.dot(y)
-        for _ in range(ROUNDS):
-            if not rho > 0:
-                break
-            M.mult(p, q)
-            step = rho / p.dot(q)
-            state.v.axpy(step, p)
-            r.axpy(-step, q)
-            y.pointwiseMult(inverse, r)
-            rho, before = r.dot(y), rho
-            p.aypx(rho / before, y)
-
-    def destroy(self) -> None:
-        """Free the vectors. Collective."""
-        for x in self.vectors:
-            x.destroy()
-        self.vectors = ()
+        rho, before = r.dot(y), rho
+        p.aypx(rho / before, y)
