@@ -3,7 +3,7 @@
 # ruff: noqa: E402  (the other imports take a second, in which Ctrl-C shall not end in a traceback)
 from __future__ import annotations
 
-from softgrasp.study.shell.loading import loading, quiet_imports
+from softgrasp.study.shell.loading import lasting_imports, loading, quiet_imports
 
 quiet_imports()
 
@@ -367,6 +367,7 @@ def effects(**shared: Any) -> None:
 
 def main() -> None:
     """Entry point. Collective, but for the commands that load no MPI: doctor, scenes, schema, --help, --version."""
+    lasting_imports()
     run_command(app)
 
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg
 
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs, output_columns
@@ -53,8 +52,9 @@ class KrylovModel:
     @cached_property
     def modes(self) -> tuple[Array, Array]:
         """Ritz frequencies omega (N,), ascending [1/s], and modes (N, N) with Phi' M Phi = 1."""
-        squares, Phi = scipy.linalg.eigh(np.eye(len(self.M)), self.M)
-        return np.sqrt(squares), Phi
+        squares, Phi = np.linalg.eigh(self.M)  # 1 / omega^2: V'K V is the identity
+        omega = 1 / np.sqrt(squares[::-1])
+        return omega, Phi[:, ::-1] * omega
 
 
 @contextmanager
@@ -154,7 +154,7 @@ def _midpoint(
 ) -> tuple[Array, Array]:
     """M x'' + D x' + K x = B u + f from rest at x for inputs u at the midpoints: x (n + 1, N) and x'' (n, N)."""
     N, one = len(x), np.eye(len(x))
-    E, A = scipy.linalg.block_diag(one, M), np.block([[0 * one, one], [-K, -D]])
+    E, A = np.block([[one, 0 * one], [0 * one, M]]), np.block([[0 * one, one], [-K, -D]])
     loads = np.vstack([np.zeros((N, B.shape[1] + 1)), np.column_stack([B, f])])
     w = MidpointSteps(dt, E, A, loads).march(inputs, np.append(x, np.zeros(N)))
     return w[:, :N], np.diff(w[:, N:], axis=0) / dt

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -55,8 +55,8 @@ def expected_order(ends: Ends, order: int, graded: bool, edges: bool = False) ->
     return min(full, 2 * float(ends.alpha.min(initial=full)))
 
 
-def exponent(angle: float, nu: float, held: int) -> float:
-    """Real part of the smallest exponent alpha > 0 of u ~ r^alpha at a corner in plane strain [W52].
+def exponents(angle: Floats, nu: Floats, held: Integers) -> Floats:
+    """Real parts of the smallest exponents alpha > 0 of u ~ r^alpha at corners in plane strain [W52].
 
     With kappa = 3 - 4 nu,
 
@@ -65,45 +65,53 @@ def exponent(angle: float, nu: float, held: int) -> float:
         sin^2(alpha w) = alpha^2 sin^2 w / kappa^2                               both sides held.
 
     Args:
-        angle: angle w of the body [rad], 0 < w <= 2 pi.
-        nu: Poisson's ratio [1].
-        held: how many of the two sides are held, 0 to 2.
+        angle: angles w of the body [rad], 0 < w <= 2 pi, (n,).
+        nu: Poisson's ratios [1], (n,).
+        held: how many of the two sides are held, 0 to 2, (n,).
 
     Returns:
-        alpha, at most 1 (beyond which nothing is singular).
+        alpha, at most 1 (beyond which nothing is singular), (n,).
     """
-    kappa, s = 3 - 4 * nu, np.sin(angle)
-    if held == 1:
-        return _mixed(angle, kappa, s)
-    if angle <= np.pi:  # nothing is singular there
-        return 1.0
-    from scipy.optimize import brentq  # slow to import, and few bodies have such a corner
-
-    best, grid = 1.0, np.linspace(0.05, 1 - 1e-9, 400)
-    for factor in (s, -s) if held == 0 else (s / kappa, -s / kappa):
-
-        def gap(a: Any, factor: float = factor) -> Any:
-            return np.sin(a * angle) - factor * a
-
-        changes = np.flatnonzero(np.diff(np.sign(gap(grid))))
-        if changes.size:
-            best = min(best, float(brentq(gap, *grid[changes[0] : changes[0] + 2])))
-    return best
+    alpha = np.ones(len(angle))
+    mixed = held == 1
+    alpha[mixed] = _mixed(angle[mixed], 3 - 4 * nu[mixed])
+    alike = np.flatnonzero(~mixed & (angle > np.pi))  # at smaller angles nothing is singular
+    w = angle[alike]
+    factor = np.sin(w) / np.where(held[alike] == 0, 1.0, 3 - 4 * nu[alike])
+    alpha[alike] = np.minimum(_crossing(w, factor), _crossing(w, -factor))
+    return alpha
 
 
-def _mixed(angle: float, kappa: float, s: float) -> float:
-    """Smallest root with one side held, by Newton from a grid of complex starts."""
+def _crossing(w: Floats, factor: Floats) -> Floats:
+    """Smallest roots a < 1 of sin(a w) = factor a, by bisection where a grid changes sign first; 1 without any."""
+    grid = np.linspace(0.05, 1 - 1e-9, 400)
+    signs = np.sign(np.sin(np.multiply.outer(w, grid)) - np.multiply.outer(factor, grid))
+    changes = np.diff(signs, axis=1) != 0
+    first = changes.argmax(axis=1)
+    low, high, before = grid[first], grid[first + 1], signs[np.arange(len(w)), first]
+    for _ in range(40):  # leaves 2e-15
+        middle = (low + high) / 2
+        beyond = np.sign(np.sin(middle * w) - factor * middle) != before
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    return np.where(changes.any(axis=1), high, 1.0)
+
+
+def _mixed(w: Floats, kappa: Floats) -> Floats:
+    """Smallest roots with one side held, by Newton from a grid of complex starts, at most 1."""
+    w, kappa = w[:, None], kappa[:, None]
+    s = np.sin(w)
 
     def gap(z: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
-        return np.asarray(np.sin(z * angle) ** 2 - ((kappa + 1) ** 2 - 4 * z**2 * s**2) / (4 * kappa))
+        return np.asarray(np.sin(z * w) ** 2 - ((kappa + 1) ** 2 - 4 * z**2 * s**2) / (4 * kappa))
 
-    z = (np.linspace(0.2, 1.1, 19)[:, None] + 1j * np.array([0.0, 0.05, 0.1, 0.2, 0.4])).ravel()
+    starts = (np.linspace(0.2, 1.1, 19)[:, None] + 1j * np.array([0.0, 0.05, 0.1, 0.2, 0.4])).ravel()
+    z = np.tile(starts, (len(w), 1))
     for _ in range(30):  # what converges has rounding left after 25
-        slope = angle * np.sin(2 * z * angle) + 2 * z * s**2 / kappa
+        slope = w * np.sin(2 * z * w) + 2 * z * s**2 / kappa
         z = z - gap(z) / np.where(np.abs(slope) > 1e-12, slope, 1e-12)
         z = np.where(np.isfinite(z) & (np.abs(z) < 10), z, 10.0)
-    real = z.real[(np.abs(gap(z)) < 1e-9) & (z.real > 0.02) & (np.abs(z) < 9)]
-    return float(min(real.min(initial=1.0), 1.0))
+    roots = (np.abs(gap(z)) < 1e-9) & (z.real > 0.02) & (np.abs(z) < 9)
+    return np.asarray(np.where(roots, z.real, 1.0).min(axis=1, initial=1.0))
 
 
 def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integers, nu: Floats) -> Ends:
@@ -133,16 +141,17 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
     kinds: list[Kind] = []
     boundary = on["held"] + on["free"] > 0
     odd = boundary & ((on["held"] > 0) | (np.abs(angle - np.pi) > STRAIGHT))
-    cache: dict[tuple[int, int, int], float] = {}
-    for i in np.flatnonzero(odd).tolist():
-        sides = 1 if on["held"][i] and on["free"][i] else 0 if on["free"][i] else 2
-        key = (round(angle[i] * 1e4), round(ratio[i] * 1e6), sides)
-        if key not in cache:
-            cache[key] = exponent(min(angle[i], 2 * np.pi), ratio[i], sides)
-        if cache[key] < REGULAR:
+    at = np.flatnonzero(odd)
+    sides = np.where(on["held"][at] == 0, 0, np.where(on["free"][at] == 0, 2, 1))
+    keys = np.column_stack([np.round(angle[at] * 1e4), np.round(ratio[at] * 1e6), sides])
+    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    one = at[first]
+    alpha = exponents(np.minimum(angle[one], 2 * np.pi), ratio[one], sides[first])[inverse.ravel()]
+    for i, a, side in zip(at.tolist(), alpha.tolist(), sides.tolist(), strict=True):
+        if a < REGULAR:
             chosen.append(i)
-            alphas.append(cache[key])
-            kinds.append(KINDS[sides])
+            alphas.append(a)
+            kinds.append(KINDS[side])
     for i in np.flatnonzero(_layer_ends(points, between, ridges, on["inner"], boundary, d)).tolist():
         if i not in chosen:
             chosen.append(i)

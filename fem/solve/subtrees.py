@@ -17,9 +17,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
-import scipy.sparse.linalg
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import SolverError, raise_on_all_ranks
@@ -64,9 +62,12 @@ class SplitFactor:
         share = np.zeros_like(sigma)
         share[at] = C
         sigma -= total(self.comm, share)
-        self.top, failed = scipy.linalg.lapack.dpotrf(sigma, lower=1)
+        from scipy.linalg.lapack import dpotrf, dpotrs  # slow to import, and for ranks in 2D alone
+
+        self.top, failed = dpotrf(sigma, lower=1)
         if failed:  # on every rank alike
             raise SolverError(INDEFINITE)
+        self.dpotrs = dpotrs
         self.factor = self.ksp.getPC().getFactorMatrix()
         self.r, self.w = self.factor.createVecs()
         self.sum, self.share = np.zeros(len(G)), np.zeros(len(G))
@@ -83,7 +84,7 @@ class SplitFactor:
         self.share[self.touched] = self.t * swept[n:]
         self.share[self.mine] += rows[self.own]
         self.comm.Allreduce(self.share, self.sum)
-        solved, _ = scipy.linalg.lapack.dpotrs(self.top, self.sum, lower=1)
+        solved, _ = self.dpotrs(self.top, self.sum, lower=1)
         swept[n:] = solved[self.touched]
         self.factor.solveBackward(self.w, self.r)
         result = w.array_w
@@ -132,9 +133,11 @@ def _bordered(inside: Any, across: Any, border: Array) -> Any:
 
 def _eliminated(inside: Any, across: Any, border: Array) -> Array:
     """C = S_GI S_II^-1 S_IG, dense, from a factor of [S_II, S_IG; S_GI, border], which leaves border - C."""
+    from scipy.sparse.linalg import splu  # slow to import, and for ranks in 2D alone
+
     options = {"SymmetricMode": True, "Equil": False}
     try:
-        lu = scipy.sparse.linalg.splu(
+        lu = splu(
             _bordered(inside, across, border).tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options
         )
     except RuntimeError as error:
