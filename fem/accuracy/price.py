@@ -7,7 +7,7 @@ needs n^1.5 in 2D and n^2 in 3D, a solve with it n log n and n^(4/3), by nested 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from softgrasp.fem.accuracy.estimate import MOST_COMPARED, next_unknowns
@@ -16,7 +16,7 @@ from softgrasp.fem.accuracy.surplus import ITERATIONS, MODES
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.run.forecast import forecast
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.solve.costs import BUILD, ENTRIES, Work
+from softgrasp.fem.solve.costs import BUILD, ENTRIES, FEW_SOLVES, Work
 
 SHARE = 0.3  # of a run's work that an estimate may need without --certify
 PRODUCTS = 4  # with a column of a Krylov model, for its inner products
@@ -110,8 +110,10 @@ def _estimate_seconds(model: Model, share: float = 1.0) -> float:
 
 def _krylov(model: Model, d: int, p: int, n: float) -> float:
     """Of a Krylov model of n unknowns: a factor, and some solves and products of each column."""
-    work = Work(int(n), d, p, 1, BLOCKS * _columns(model), True, model.system.contrast)
-    return work.seconds(work.solver()) + work.solves * PRODUCTS * work.product(ENTRIES[d, p])
+    system = model.system
+    work = Work(int(n), d, p, 1, BLOCKS * _columns(model), True, system.contrast, graded=system.graded)
+    name = replace(work, solves=FEW_SOLVES).solver()
+    return work.seconds(name) + work.solves * PRODUCTS * work.product(ENTRIES[d, p])
 
 
 def _columns(model: Model) -> int:

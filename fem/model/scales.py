@@ -11,8 +11,7 @@ from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.material import of_layers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, normalising, times_columns, total
-from softgrasp.fem.solve.solvers import choose_solver
-from softgrasp.fem.solve.stiffness import factored_stiffness
+from softgrasp.fem.solve.stiffness import factored_stiffness, static_solver
 from softgrasp.fem.system import BlockSystem
 
 SMALL_STRAIN = 0.1  # linear elasticity neglects terms of this relative size
@@ -84,7 +83,7 @@ def measure_sag(model: Model, a: Array) -> tuple[Sag, Gradient]:
     load = g - a
     if weight is None:
         g = np.eye(layout.n_s)[d - 1] * -EARTH
-    columns, (solver, _) = system.G @ np.column_stack([g, load]), choose_solver(layout, scene.time.solver, few=True)
+    columns, solver = system.G @ np.column_stack([g, load]), static_solver(system, scene.time.solver)
     with factored_stiffness(system, solver, reproducible=scene.time.reproducible) as factor:
         Z = factor.columns(columns, "the static equilibrium")
     largest = float(np.linalg.norm(Z[:, 0].reshape(-1, d), axis=1).max(initial=0.0))

@@ -18,7 +18,7 @@ from softgrasp.fem.model.memory import factor_bytes, free_bytes, need, steps_of
 from softgrasp.fem.resources import size_text
 from softgrasp.fem.run.states.frames import frame_count
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.solve.costs import BUILD, ENTRIES, ITERATIVE, SolverName, seams
+from softgrasp.fem.solve.costs import BUILD, ENTRIES, FEW_SOLVES, ITERATIVE, SolverName, seams
 
 if TYPE_CHECKING:
     from softgrasp.fem.run.contact.expected import ExpectedContact
@@ -74,13 +74,15 @@ def forecast(
     """
     kind, work, share = (d, scene.tissue.order), steps_of(scene, n, d, ranks), seams(n, d, ranks)
     name, requested = work.solver(scene.time.solver, free), scene.time.solver
-    static, first = replace(work, solves=1, few=True), scene.time.start == "equilibrium" and scene.effects.gravity
+    first = scene.time.start == "equilibrium" and scene.effects.gravity
+    static = replace(work, solves=FEW_SOLVES, few=True)
+    resting = static.solver(requested, free)
     frames = frame_count(scene, n) + 1 if scene.output.fields != "none" else 0
     memory = need(scene, d, cells, ranks, free, run=True).of(1.0, ranks) + ranks * LIBRARIES
     if name in ITERATIVE:
         memory += work.memory(name)
     if first:  # both are there at once
-        memory += static.memory(static.solver(requested))
+        memory += static.memory(resting)
     if touching is not None:
         memory += touching.memory(n, ranks, work.copies(name), name)
     return Forecast(
@@ -88,7 +90,7 @@ def forecast(
         solver=name,
         build=BUILD[kind] * cells * share,
         setup=work.setup(name),
-        equilibrium=static.seconds(static.solver(requested)) if first else 0.0,
+        equilibrium=static.setup(resting) + static.solve(resting) if first else 0.0,
         steps=work.solves * (work.solve(name) + PRODUCTS * work.product(ENTRIES[kind])),
         frames=frames,
         fields=frames * FRAME[kind] * cells * share,

@@ -35,8 +35,8 @@ from softgrasp.fem.run.states.checkpoint import RestartState, read_checkpoint, w
 from softgrasp.fem.run.states.frames import boundaries, output_recorders
 from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.run.stepping import Stepped, make_ts
-from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
+from softgrasp.fem.solve.stiffness import static_solver
 
 if TYPE_CHECKING:
     from softgrasp.fem.run.contact.general import Contact
@@ -151,7 +151,7 @@ class Run(Stepped):
             return resting(self.contact, self.drive.q[0], time)
         if self.turning is not None:
             system = self.turning.as_it_hangs()
-        return equilibrium(system, choose_solver(system.layout, time.solver, few=True)[0], time, self.settle)
+        return equilibrium(system, static_solver(system, time.solver), time, self.settle)
 
     def take(self, ts: Any, step: int, check: bool = False) -> None:
         """Step up to a number, and see that the forces on the way were finite. Collective.

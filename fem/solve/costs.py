@@ -26,7 +26,8 @@ STEP_RTOL = {"cg": 1e-8, "stars": 1e-4}
 GUESSED = {"cg": 0.6, "stars": 0.3}
 GRADED = 2.5  # iterations on lines that crowd over those on even cells [1]: cg 2.2 to 2.6, stars 2.8
 DAMPED = 0.5  # share of these iterations that damped steps need, for their last solutions predict the next better [1]
-FEW_SOLVES = 20  # solves of an equilibrium, a mesh estimate or modes with one factor [1]
+FEW_SOLVES = 20  # solves of equilibrium, mesh estimate or modes with one factor, and of all where it is shared [1]
+UNKNOWN = 1e8  # contrast of matrices whose iterations the model does not know: a factor, while one is a candidate [1]
 PARALLEL = 0.62  # exponent p of the time ranks^-p of a factor spread over ranks [1]: 0.65 on two ranks, measured
 SEAMS = {2: 0.1, 3: 0.32}  # share of work at the seams between ranks of 1e5 unknowns each, by dimension [1]
 MESSAGE = 2e-6  # time of a message between nodes [s]: a network's, not measured here
@@ -154,11 +155,9 @@ class Work:
         return self.setup(name) + self.solves * self.solve(name)
 
     def candidates(self) -> list[SolverName]:
-        """Solvers of these elements that are measured at this size; few solves go to a factor while it fits."""
+        """Solvers of these elements that are measured at this size."""
         kind = self._kind, self.order > 1
-        names = [name for (name, *of), cost in COSTS.items() if tuple(of) == kind and self.n <= cost.most]
-        direct = [name for name in names if name not in ITERATIVE]
-        return direct if self.few and direct else names
+        return [name for (name, *of), cost in COSTS.items() if tuple(of) == kind and self.n <= cost.most]
 
     def leanest(self) -> SolverName:
         """The candidate with the least modelled memory."""

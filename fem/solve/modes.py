@@ -10,8 +10,8 @@ from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc, from_options
-from softgrasp.fem.solve.solvers import ITERATIVE, TissueSolver, choose_solver
-from softgrasp.fem.solve.stiffness import factored_stiffness
+from softgrasp.fem.solve.solvers import ITERATIVE, TissueSolver
+from softgrasp.fem.solve.stiffness import factored_stiffness, static_solver
 from softgrasp.fem.system import BlockSystem
 
 PREFIX = "softgrasp_modes_"
@@ -43,7 +43,7 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
     key = (system.K_ee.handle, system.K_ee.stateGet(), system.M_ee.handle, system.M_ee.stateGet())
     kept = system.kept.get("modes")
     if kept is None or kept[0] != key or len(kept[1]) < k:
-        name = choose_solver(system.layout, few=True)[0]  # as for static solves, whose factor is this one
+        name = static_solver(system)  # whose factor this is
         with factored_stiffness(system, name) as solver:
             kept = key, *_lowest(system, solver, k), system.K_ee, system.M_ee  # no other can get their handles
         if system.M_ee.getType() != PETSc.Mat.Type.PYTHON and k * n_e <= KEPT_ENTRIES:

@@ -23,7 +23,7 @@ from softgrasp.fem.solve.cholesky import (
     make_ksp,
     solve_checked,
 )
-from softgrasp.fem.solve.costs import FEW_SOLVES, Work
+from softgrasp.fem.solve.costs import FEW_SOLVES, UNKNOWN, Work
 from softgrasp.fem.solve.costs import ITERATIVE as ITERATIVE
 from softgrasp.fem.solve.costs import Reproducible as Reproducible
 from softgrasp.fem.solve.costs import SolverName as SolverName
@@ -57,7 +57,7 @@ def choose_solver(
     layout: BlockLayout,
     requested: str = "auto",
     few: bool = False,
-    contrast: float = 1.0,
+    contrast: float = UNKNOWN,
     steps: int = 200,
     memory: float = np.inf,
 ) -> tuple[SolverName, str]:
@@ -65,7 +65,7 @@ def choose_solver(
 
     Args:
         few: some static solves with one factor, not the steps of a run.
-        contrast: largest lambda / mu, which iterations grow with.
+        contrast: largest lambda / mu, which iterations grow with; not known: a factor while one is a candidate.
         steps: of the run.
         memory: that set-up and factor may use, over all ranks [byte].
     """

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol, cast
 
+from mpi4py import MPI
+
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.resources import free_memory
+from softgrasp.fem.solve.costs import FEW_SOLVES, UNKNOWN
 from softgrasp.fem.solve.solvers import (
     ITERATIVE,
     Reproducible,
     SolverName,
     TissueSolver,
-    choose_solver,
     factor_on_every_rank,
     make_solver,
+    work_of,
 )
 
 if TYPE_CHECKING:
@@ -73,6 +78,23 @@ def shared_factor[S: Shared](system: BlockSystem, name: str, key: object, make: 
             made.destroy()
 
 
+def static_solver(system: BlockSystem, requested: str = "auto", solves: int = FEW_SOLVES) -> SolverName:
+    """The solver of the least modelled time for static solves with K_ee, or K_ee + s D_ee + s^2 M_ee. Collective.
+
+    A system has one for each number of solves, however much memory is left later, so that its factor is shared.
+    """
+    if requested != "auto":
+        return cast(SolverName, requested)
+    chosen = system.kept.setdefault("static solvers", {})
+    if solves not in chosen:
+        # tangents of finite strain may lose definiteness, which a factor reports
+        known = bool(system.materials) and system.points is None
+        work = work_of(system.layout, solves, True, system.contrast if known else UNKNOWN)
+        free = system.layout.comm.allreduce(free_memory(), MPI.MIN)
+        chosen[solves] = replace(work, graded=system.graded).solver(memory=free)
+    return cast(SolverName, chosen[solves])
+
+
 @contextmanager
 def factored_stiffness(
     system: BlockSystem,
@@ -83,13 +105,13 @@ def factored_stiffness(
     """K_ee, factored (or the set-up of cg and stars) on the first request, and kept while it is small. Collective.
 
     Args:
-        solver: its name; None: the one that suits few solves.
+        solver: its name; None: that of :func:`static_solver`.
         rtol: of cg and stars, where no direct solver fits.
 
     Raises SolverError: the factorisation fails.
     """
     layout, K = system.layout, system.K_ee
-    name = solver or choose_solver(layout, few=True)[0]
+    name = solver or static_solver(system)
     everywhere = factor_on_every_rank(layout, name, reproducible)
     key = (K.handle, K.stateGet(), name, everywhere, rtol if name in ITERATIVE else 0.0)
     kept = system.kept.get("factor")

@@ -25,8 +25,8 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array, rows_on_all, times_columns, total
-from softgrasp.fem.solve.solvers import choose_solver, make_solver
-from softgrasp.fem.solve.stiffness import static_columns
+from softgrasp.fem.solve.solvers import make_solver
+from softgrasp.fem.solve.stiffness import static_columns, static_solver
 from softgrasp.fem.system import dynamic_stiffness
 from softgrasp.lqr.constrained.tissue import ModalTissue, Surface, poles
 from softgrasp.lqr.lowrank.shifts import frequency_estimate
@@ -192,7 +192,7 @@ class _Shifted:
     def __init__(self, problem: RiccatiProblem, s: float) -> None:
         system, layout = problem.system, problem.layout
         self.problem, self.s, self.comm = problem, s, layout.comm
-        name = choose_solver(layout, few=True)[0]
+        name = static_solver(system)
         self.solver = make_solver(dynamic_stiffness(system, s), name, layout, PREFIX, rtol=1e-12)
         if system.two_way:
             self.S_G = self.solver.columns(np.asfortranarray(system.G))

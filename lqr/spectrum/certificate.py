@@ -13,8 +13,8 @@ from slepc4py import SLEPc
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc, from_options, total
 from softgrasp.fem.shown import Shown
-from softgrasp.fem.solve.solvers import choose_solver, make_solver
-from softgrasp.fem.solve.stiffness import shared_factor
+from softgrasp.fem.solve.solvers import make_solver
+from softgrasp.fem.solve.stiffness import shared_factor, static_solver
 from softgrasp.fem.system import dynamic_stiffness
 from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.lowrank.compress import gram
@@ -200,7 +200,7 @@ class OpenLoop:
         self.problem, self.shift = problem, shift
         self.system, self.layout, self.comm = problem.system, problem.layout, problem.layout.comm
         self.drag = self.system.damping.drag
-        name = choose_solver(self.layout, few=True)[0]
+        name = static_solver(self.system)
         self.solver = make_solver(dynamic_stiffness(self.system, shift), name, self.layout, PREFIX, rtol=1e-12)
         system, sigma, n_s = self.system, shift, self.layout.n_s
         hand = sigma**2 * problem.M_s

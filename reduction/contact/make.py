@@ -19,8 +19,8 @@ from softgrasp.fem.run.contact.expected import nearest_gaps
 from softgrasp.fem.run.midpoint import viscosity
 from softgrasp.fem.run.motion import motion_table
 from softgrasp.fem.solve.modes import lowest_modes
-from softgrasp.fem.solve.solvers import choose_solver, make_solver
-from softgrasp.fem.solve.stiffness import static_columns
+from softgrasp.fem.solve.solvers import make_solver
+from softgrasp.fem.solve.stiffness import static_columns, static_solver
 from softgrasp.fem.system import BlockSystem, dynamic_stiffness
 from softgrasp.reduction.contact.model import ContactModel, Ints, plane
 from softgrasp.reduction.origin import origin_of
@@ -179,7 +179,7 @@ def _landing(system: BlockSystem, surface: Surface, kept: Ints, normals: Array, 
     there[(kept[:, None] * d + np.arange(d)).ravel()] = True
     rows = surface.rows[there[surface.mine]]
     loads[rows] = moved[rows]
-    solver = make_solver(dynamic_stiffness(system, s), choose_solver(layout, few=True)[0], layout, PREFIX, rtol=1e-12)
+    solver = make_solver(dynamic_stiffness(system, s), static_solver(system), layout, PREFIX, rtol=1e-12)
     try:
         return solver.columns(loads, "the answer to a landing")
     finally:

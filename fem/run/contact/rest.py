@@ -14,9 +14,8 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.obstacles.responses import Responses
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Time
-from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
-from softgrasp.fem.solve.stiffness import factored_stiffness
+from softgrasp.fem.solve.stiffness import factored_stiffness, static_solver
 
 if TYPE_CHECKING:
     from softgrasp.fem.run.contact.general import Contact
@@ -30,7 +29,7 @@ def resting(contact: Contact, q: Array, time: Time) -> Array:
     Collective. Raises SolverError: the stiffness is singular, or no solution is found, as where there is no room.
     """
     system, layout, surface = contact.system, contact.layout, contact.surface
-    name, _ = choose_solver(layout, time.solver, few=True)
+    name = static_solver(system, time.solver)
     free = equilibrium(system, name, time)
     with factored_stiffness(system, name, reproducible=time.reproducible) as factor:
 

@@ -8,7 +8,7 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
-from softgrasp.fem.solve.costs import COSTS, Work
+from softgrasp.fem.solve.costs import COSTS, UNKNOWN, Work
 from softgrasp.fem.solve.solvers import choose_solver
 from tests.helpers.models import make_scene
 
@@ -27,7 +27,11 @@ SILICONE = 49.0  # lambda / mu at nu = 0.49
         (100_000, 3, 2, False, SILICONE, "mumps"),
         (1_000_000, 3, 2, False, SILICONE, "stars"),
         (1_000_000, 3, 1, False, SILICONE, "cg"),
-        (100_000, 3, 2, True, 1.5, "mumps"),  # few solves keep their digits while a factor fits
+        (100_000, 3, 2, True, 1.5, "mumps"),
+        (200_000, 3, 2, True, 1.5, "stars"),  # 20 static solves at nu = 0.3 are worth no factor
+        (200_000, 3, 2, True, SILICONE, "mumps"),
+        (200_000, 3, 1, True, UNKNOWN, "mumps"),  # any other matrix goes to a factor while it fits
+        (400_000, 3, 2, True, UNKNOWN, "stars"),
         (200_000, 3, 2, False, 1.5, "stars"),  # a third of the iterations of nu = 0.49
     ],
 )

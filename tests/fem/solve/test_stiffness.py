@@ -41,7 +41,7 @@ def test_equilibrium_modes_and_estimate_share_a_factor(
     comm: MPI.Intracomm, made: list[str], monkeypatch: pytest.MonkeyPatch, solver: str
 ) -> None:
     for module in ("stiffness", "modes"):
-        monkeypatch.setattr(f"softgrasp.fem.solve.{module}.choose_solver", lambda *_, **__: (solver, "asked for here"))
+        monkeypatch.setattr(f"softgrasp.fem.solve.{module}.static_solver", lambda *_: solver)
     model = build(make_scene(WEIGHT), comm=comm)
     system = model.system
     z = equilibrium(system)
@@ -110,3 +110,20 @@ def test_momenta_are_solved_without_a_factor(comm: MPI.Intracomm, made: list[str
     size, wrong = total(comm, np.array([np.sum(system.G**2), np.sum(error**2)]))
     assert wrong < 1e-22 * size  # the square of ten times its tolerance
     assert not made
+
+
+def test_static_solves_have_the_solver_of_the_least_modelled_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By contrast, grading and memory of the system; one for all that share its factor, whatever memory is left."""
+    nearly: dict[str, Any] = {"tissue": {"material": {"lambda": 49.0, "mu": 1.0, "rho": 1.0}}}
+    names = []
+    for changes in ([CUBE], [CUBE, nearly], [CUBE, {"tissue": {"refine": {}}}]):
+        system = build(make_scene({"tissue": {"order": 2}}, *changes), comm=MPI.COMM_SELF).system
+        large = replace(system, layout=replace(system.layout, n_e=200_000), kept={})
+        names.append(stiffness.static_solver(large))
+        monkeypatch.setattr(stiffness, "free_memory", lambda: 1e9)
+        assert stiffness.static_solver(large) == names[-1]
+        assert stiffness.static_solver(replace(large, kept={})) == "stars"  # a factor takes 2.7 GB
+        monkeypatch.undo()
+    assert names == ["stars", "mumps", "mumps"]
+    assert stiffness.static_solver(replace(large, materials=(), kept={})) == "mumps"  # iterations are not known
+    assert stiffness.static_solver(large, "cholesky") == "cholesky"
