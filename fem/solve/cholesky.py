@@ -4,7 +4,8 @@ PETSc's solves with blocks need less time than those with single entries (``pyth
 prints both): one index serves d^2 numbers, and d unknowns at a time. But PETSc factors such a matrix in the order in
 which it comes, so the rows are put in order first (:func:`dissect`); and it multiplies by inverses of
 the blocks on the diagonal, which is stable only while these are well conditioned [DHS95]. So two solves are measured,
-and a factor of single entries is made where blocks would lose digits.
+and a factor of single entries is made where blocks would lose digits. The pattern is found as that of an incomplete
+factor (ICC) of which no level is left out: for blocks PETSc's Cholesky clears an array of all rows for each row.
 """
 
 from __future__ import annotations
@@ -106,6 +107,9 @@ def rows_of(nodes: NDArray[np.intp], d: int) -> NDArray[np.intp]:
 # in the hard cases with layers or nu near 0.5. Ten rounding units separate them.
 BACKWARD_ERROR = 10 * float(np.finfo(float).eps)
 WIDTH = 16  # columns that MUMPS solves at once: 12 of 2e4 unknowns in 3D take a sixth of the time of one by one [1]
+PACKAGES = {"petsc": "PETSc", "mumps": "MUMPS"}  # PETSc's names of those that factor
+FACTORS = ("cholesky", "lu")  # PETSc's names of direct preconditioners
+EVERY_LEVEL = 2**31 - 1  # levels of fill of an incomplete factor that is complete [1]
 VANISHING_PIVOT = (71, 81)  # PETSC_ERR_MAT_LU_ZRPVT, PETSC_ERR_MAT_CH_ZRPVT
 
 
@@ -174,16 +178,36 @@ def make_ksp(P: PETSc.Mat, prefix: str, by: Literal["petsc", "mumps"] = "petsc")
     ksp = PETSc.KSP().create(P.comm)
     ksp.setOptionsPrefix(prefix)
     ksp.setOperators(P)
-    P.destroy()  # the ksp owns it
     ksp.setType("preonly")
     pc = ksp.getPC()
     pc.setType("cholesky")
     if by == "mumps":
         pc.setFactorSolverType("mumps")
-    else:
+    elif in_blocks(P) and not user_options(prefix):
+        pc.setType("icc")
+        pc.setFactorLevels(EVERY_LEVEL)
+        pc.setFactorShift(PETSc.Mat.FactorShiftType.NONE)
+    if by == "petsc":
         pc.setFactorOrdering("natural")
+    P.destroy()  # the ksp owns it
     from_options(ksp)
     return ksp
+
+
+def in_blocks(P: PETSc.Mat) -> bool:
+    """Whether the matrix stores symmetric blocks."""
+    return "sbaij" in P.getType() and P.getBlockSize() > 1
+
+
+def is_factor(pc: PETSc.PC) -> bool:
+    """Whether a preconditioner is a whole factor, as the incomplete one of blocks always is (:func:`make_ksp`)."""
+    return pc.getType() in FACTORS or (pc.getType() == "icc" and in_blocks(pc.getOperators()[1]))
+
+
+def package_of(pc: PETSc.PC) -> str:
+    """Package that factors, or the preconditioner where none does, as PETSc reports it."""
+    by = pc.getFactorSolverType() if is_factor(pc) else pc.getType().upper()
+    return PACKAGES.get(by, str(by))
 
 
 def solve_checked(ksp: PETSc.KSP, r: PETSc.Vec, w: PETSc.Vec, name: str) -> None:

@@ -20,7 +20,9 @@ from softgrasp.fem.solve.cholesky import (
     direct_solves,
     dissect,
     factor_blocks,
+    is_factor,
     make_ksp,
+    package_of,
     solve_checked,
 )
 from softgrasp.fem.solve.costs import FEW_SOLVES, UNKNOWN, Work
@@ -41,8 +43,6 @@ OUT_OF_MEMORY = 3  # PC_FACTOR_OUTMEMORY
 # Percent beyond the estimate that MUMPS reserves on each rank. With PETSc's 20 one of four set-ups on two ranks of a
 # busy machine failed, for a cause that was not found; pages that are not touched need no memory.
 WORKSPACE = 100
-PACKAGES = {"petsc": "PETSc", "mumps": "MUMPS"}  # PETSc's names of those that factor
-FACTORS = ("cholesky", "lu")  # PETSc's names of direct preconditioners
 
 
 class SolverUsed(NamedTuple):
@@ -88,12 +88,6 @@ def factor_on_every_rank(
     return replace(work_of(layout, 1, False, 1.0, reproducible), linear=linear).repeated(solver)
 
 
-def package_of(pc: PETSc.PC) -> str:
-    """Package that factors, or the preconditioner where none does, as PETSc reports it."""
-    by = pc.getFactorSolverType() if pc.getType() in FACTORS else pc.getType().upper()
-    return PACKAGES.get(by, str(by))
-
-
 @dataclass(frozen=True)
 class TissueSolver:
     """A factored (or preconditioned) symmetric positive definite matrix of the tissue block."""
@@ -118,7 +112,7 @@ class TissueSolver:
     def entries(self) -> float | None:
         """Nonzero entries of the factor, as PETSc counts them; None where there is none. Collective."""
         pc = self.ksp.getPC()
-        return float(pc.getFactorMatrix().getInfo()["nz_used"]) if pc.getType() in FACTORS else None
+        return float(pc.getFactorMatrix().getInfo()["nz_used"]) if is_factor(pc) else None
 
     def used(self, reason: str) -> SolverUsed:
         """This solver with the reason of its choice; to it are added the user's options, or single entries (slower)."""

@@ -18,8 +18,7 @@ from softgrasp.fem.errors import ResourceError, SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, Complex, PETSc, from_options, petsc_options, whole_copy
 from softgrasp.fem.resources import free_memory
-from softgrasp.fem.solve.cholesky import direct_solves
-from softgrasp.fem.solve.solvers import package_of
+from softgrasp.fem.solve.cholesky import direct_solves, package_of
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.lowrank.ahead import FactorsAhead
 from softgrasp.lqr.plant.checks import MODAL_KEY

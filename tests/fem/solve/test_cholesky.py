@@ -17,7 +17,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import whole_copy
 from softgrasp.fem.run.midpoint import TissueMidpoint, midpoint_matrix, state_on
 from softgrasp.fem.run.simulate import RunOptions, simulate
-from softgrasp.fem.solve.cholesky import BACKWARD_ERROR, backward_error, dissect, factor_blocks, make_ksp
+from softgrasp.fem.solve.cholesky import BACKWARD_ERROR, backward_error, dissect, factor_blocks, make_ksp, package_of
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from tests.helpers.models import CUBE, close, gather_matrix, gather_rows, local_rows, make_scene
 
@@ -81,6 +81,25 @@ def test_order_keeps_the_factor_thin(comm: MPI.Intracomm) -> None:
     assert kept < 1.1 * kept_nonzeros(system.K_ee, "nd")
     assert kept < 0.7 * kept_nonzeros(system.K_ee, "natural")
     ksp.destroy()
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("name", SCENES)
+def test_pattern_with_every_level_is_that_of_cholesky(comm: MPI.Intracomm, name: str) -> None:
+    system = build(make_scene(*SCENES[name]), comm=comm).system
+    P = dissect(system.K_ee, system.layout.dimension).matrix(system.K_ee)
+    ksp = make_ksp(P.convert("sbaij", PETSc.Mat()), "test_")
+    ksp.getPC().setType("cholesky")
+    ksp.getPC().setFactorOrdering("natural")
+    ksp.setUp()
+    found = []
+    for one in (factor_blocks(P, "test_"), ksp):
+        r, w = factor_of(one).createVecs()
+        r.array_w[:] = np.random.default_rng(1).standard_normal(P.getSize()[0])
+        factor_of(one).solve(r, w)
+        found.append((factor_of(one).getInfo()["nz_used"], w.array_r.tolist(), package_of(one.getPC())))
+        one.destroy()
+    assert found[0] == found[1]  # the same entries in the same order: the same bits
 
 
 @pytest.mark.ranks
