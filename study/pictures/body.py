@@ -56,6 +56,9 @@ def make_view(
     path = picture.path(table[:, 1:], grip)
     boxes = [_box(picture.points + u) for u in states] + [_box(path)]
     boxes += [_box(np.vstack(shapes.moved(picture, polygons, q))) for q in hands if polygons]
+    if picture.dimension == 3:
+        plates = [[*behind, *before] for behind, before in (hand_plate(picture, q) for q in hands)]
+        boxes += [_box(np.vstack(plate)) for plate in plates if plate]
     if aim is not None:
         boxes += [_box(p) for p in shapes.moved(picture, [picture.points, *polygons], aim)]
     box, room = _box(np.vstack(boxes)), np.array([f(np.add(picture.points, states), (0, 1)) for f in (np.min, np.max)])

@@ -22,6 +22,8 @@ CORNERS = 96  # of a circle
 FAR = 0.5  # most room that obstacles get on each side, over the size of the scene
 LONGEST = 0.3  # longest arrow over the size of the body
 BEYOND = 0.15  # of the scene, by which the drawn part of a plane in space is wider [1]
+MARGIN = np.array([0.07, 0.025])  # of a name to the frame, over the diagonal of the picture [1]
+SHOWN = 2000  # points of the bodies that a name in space keeps clear of [1]
 LEAST = 0.02  # shortest arrow that is drawn, over the longest
 
 
@@ -38,9 +40,13 @@ def draw_obstacle(ax: Any, shape: Shape, name: str, box: Array, shift: Array | f
         (polygon,), _ = polygons(shape, np.zeros(2) + shift, box)
         place = polygon.mean(axis=0)
     ax.add_collection(PolyCollection([polygon], facecolors=GREY, edgecolors=OUTLINE, lw=0.8, zorder=BEHIND))
-    margin = size * np.array([0.07, 0.025])
-    place = np.clip(place, box[0] + margin, box[1] - margin)
-    halo = [withStroke(linewidth=2.5, foreground=GREY)]  # over arrows, bodies and the path
+    margin = size * MARGIN
+    _write(ax, name, np.clip(place, box[0] + margin, box[1] - margin))
+
+
+def _write(ax: Any, name: str, place: Array) -> None:
+    """The name of an obstacle, over arrows, bodies and the path."""
+    halo = [withStroke(linewidth=2.5, foreground=GREY)]
     ax.text(
         *place, name, ha="center", va="center", fontsize=7, color=OUTLINE, clip_on=True, zorder=7, path_effects=halo
     )
@@ -71,7 +77,8 @@ def draw_surroundings(ax: Any, move: MoveView, numbers: list[int]) -> None:
     for obstacle in move.picture.obstacles:
         for k in numbers if obstacle.path is not None else numbers[:1]:
             if solid:
-                _draw_solid(ax, obstacle.shape, np.zeros(3) + obstacle.shift(move.times[k]), move.room)
+                faces = _draw_solid(ax, obstacle.shape, np.zeros(3) + obstacle.shift(move.times[k]), move.room)
+                _name_solid(ax, faces, obstacle, box, move)
             else:
                 draw_obstacle(ax, obstacle.shape, obstacle.name, box, obstacle.shift(move.times[k]))
     if move.tractions is None or solid:
@@ -103,8 +110,8 @@ def polygons(shape: Shape, shift: Array, room: Array) -> tuple[list[Array], list
     return [shapes.seen(_face(shape, i) + shift) for i in front], [_shade(n) for n in shape.normals[front]]
 
 
-def _draw_solid(ax: Any, shape: Shape, shift: Array, room: Array) -> None:
-    """An obstacle in space by parallel projection, behind the body or, clearer, before it."""
+def _draw_solid(ax: Any, shape: Shape, shift: Array, room: Array) -> list[Array]:
+    """An obstacle in space by parallel projection, behind the body or, clearer, before it; its faces in the plane."""
     place = -shape.normal if isinstance(shape, HalfSpace) else shift - room.mean(axis=0)
     if isinstance(shape, Ball | Polytope):
         place = place + (shape.center if isinstance(shape, Ball) else shape.corners.mean(axis=0))
@@ -115,6 +122,21 @@ def _draw_solid(ax: Any, shape: Shape, shift: Array, room: Array) -> None:
     ax.add_collection(
         PolyCollection(faces, facecolors=colours, edgecolors=OUTLINE, lw=0.6, zorder=order), autolim=False
     )
+    return faces
+
+
+def _name_solid(ax: Any, faces: list[Array], obstacle: Obstacle, box: Array, move: MoveView) -> None:
+    """The name of an obstacle on its faces, of a half-space beside its drawn part, as far from the bodies as can be."""
+    most = 1.0 + BEYOND if isinstance(obstacle.shape, HalfSpace) else 0.9
+    ends = [np.vstack([face, (face + np.roll(face, 1, axis=0)) / 2]) for face in faces]
+    inside = [c + share * (x - c) for x in ends for c in [x.mean(axis=0)] for share in np.linspace(0.0, most, 10)]
+    places, margin = np.vstack(inside), float(np.linalg.norm(box[1] - box[0])) * MARGIN
+    places = places[((places > box[0] + margin) & (places < box[1] - margin)).all(axis=1)]
+    if not len(places):
+        return
+    bodies = np.vstack([shapes.seen(move.picture.points + u) for u in move.states])
+    bodies = bodies[:: -(-len(bodies) // SHOWN)]
+    _write(ax, obstacle.name, places[np.linalg.norm(places[:, None] - bodies, axis=2).min(axis=1).argmax()])
 
 
 def _shade(normal: Array) -> float:

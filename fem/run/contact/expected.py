@@ -33,6 +33,9 @@ ANCESTORS = {2: 2.7, 3: 2.1}
 # with friction both inverses too, all four in single precision, and a factor of each problem of odd and of even steps.
 # Measured with 101 to 1089 rows, and 202 to 1323 with friction [byte an entry].
 SQUARES = {False: 72.0, True: 108.0}
+# Time of friction in a step, of an entry of N S^-1 N': Newton's rounds and their factors, in steps of contact and their
+# impulses; fitted to runs of `set_down` and `set_down_3d` with 122 to 1323 rows [s].
+RUB = 6e-9
 CODE = 10e6  # modules and compiled code of contact [byte]
 
 
@@ -62,7 +65,8 @@ class ExpectedContact:
         read = 2 * self._ancestors(n) if swept else n
         step = solve * min(1.0, 8.0 * self.columns * read / max(2 * factor, 1.0))
         touches = self.columns * solve * (0.5 if swept else 1.0)
-        return touches + self._fill(n) * MASS + steps * step
+        rub = RUB * self.columns**2 if self.rubs else 0.0
+        return touches + self._fill(n) * MASS + steps * (step + rub)
 
     def _swept(self, solver: SolverName) -> bool:
         return self.flat and solver == "cholesky"

@@ -72,11 +72,24 @@ def test_contact_is_expected_where_a_run_has_it(scene: str, overrides: list[str]
 
 @pytest.mark.slow
 @pytest.mark.serial
-@pytest.mark.parametrize("solver", ["mumps", "stars"])
-def test_a_run_takes_what_is_told(solver: str) -> None:
+@pytest.mark.parametrize(
+    ("scene", "overrides"),
+    [
+        ("block_3d", [*BLOCK, "time.solver=mumps"]),
+        ("block_3d", [*BLOCK, "time.solver=stars"]),
+        (
+            "set_down_3d",  # 169 nodes slip and stick; without the part of friction a third is expected
+            [
+                "tissue.order=1", "tissue.cells=[12, 12, 3]",
+                "obstacle=[{kind='halfspace', normal=[0, 0, 1], offset=-0.001, friction=0.3}]",
+            ],
+        ),
+    ],
+)  # fmt: skip
+def test_a_run_takes_what_is_told(scene: str, overrides: list[str]) -> None:
     """Within a factor of three: caches and clocks of machines differ, and what else runs."""
     begin = time.process_time()
-    model = build("block_3d", [*BLOCK, f"time.solver={solver}"])
+    model = build(scene, overrides)
     simulate(model)
     spent, expected = time.process_time() - begin, forecasts(model)[0]
     assert (expected.seconds - START) / 3 < spent < 3 * (expected.seconds - START)

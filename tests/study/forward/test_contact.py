@@ -13,6 +13,7 @@ import pytest
 from matplotlib.quiver import Quiver
 from PIL import Image
 from rich.console import Console
+from scipy.spatial import Delaunay
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.fields.picture import gather_picture
@@ -174,8 +175,11 @@ def test_pictures_show_obstacles_where_they_are() -> None:
 
 
 def test_obstacles_in_space_are_drawn_by_the_faces_that_are_seen() -> None:
-    balls = "{kind='ball', center=[0.02, -0.1, 0], radius=0.01}, {kind='box', lo=[0, 0.1, 0], hi=[0.01, 0.11, 0.01]}"
-    down = "{kind='halfspace', normal=[0, 0, 1], offset=-0.02}"
+    balls = (
+        "{name='ball', kind='ball', center=[0.02, -0.1, 0], radius=0.01}, "
+        "{name='box', kind='box', lo=[0, 0.1, 0], hi=[0.01, 0.11, 0.01]}"
+    )
+    down = "{name='table', kind='halfspace', normal=[0, 0, 1], offset=-0.02}"
     coarse = ["tissue.cells=[2, 2, 2]", "tissue.order=1", "tissue.refine=false"]
     model = build("block_3d", [*coarse, "effects.obstacles=true", f"obstacle=[{balls}, {down}]"])
     picture = gather_picture(model)
@@ -191,4 +195,12 @@ def test_obstacles_in_space_are_drawn_by_the_faces_that_are_seen() -> None:
     body = seen(picture.points[picture.points[:, 2] == 0] - [0, 0, 0.02])  # the shadow of the body on the table
     assert (corners.min(axis=0) < body.min(axis=0)).all()
     assert (corners.max(axis=0) > body.max(axis=0)).all()
+    names = {text.get_text(): text.get_position() for text in axes[0].texts}
+    assert {"ball", "box", "table"} <= set(names)  # beside those of the axes
+    assert ball.get_paths()[0].contains_point(names["ball"])
+    assert any(face.contains_point(names["box"]) for face in box.get_paths())
+    frame, place = np.array([axes[0].get_xlim(), axes[0].get_ylim()]).T, np.array(names["table"])
+    assert ((frame[0] < place) & (place < frame[1])).all()
+    inside = Delaunay(seen(picture.points)).find_simplex(place) >= 0
+    assert not inside  # beside the body
     plt.close(figure)
