@@ -32,7 +32,10 @@ def restore_velocity(midpoint: TissueMidpoint, state: TissueState) -> None:
         if not rho > 0:
             break
         M.mult(p, q)
-        step = rho / p.dot(q)
+        curvature = p.dot(q)
+        if not curvature > 0:  # of a body at rest but for numbers whose squares vanish
+            break
+        step = rho / curvature
         state.v.axpy(step, p)
         r.axpy(-step, q)
         y.pointwiseMult(inverse, r)

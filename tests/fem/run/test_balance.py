@@ -11,7 +11,9 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import rows_on_all
 from softgrasp.fem.run.energy import wide_product
+from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
 from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.run.velocity import restore_velocity
 from softgrasp.fem.solve.differences import minus_twice
 from tests.hardcases.contact import BODY, RUN, TABLE, vibrating
 from tests.helpers.models import gather_matrix
@@ -39,6 +41,19 @@ def test_a_thousand_bounces_do_not_add_up(tmp_path: Path) -> None:
     """Impulses stop the velocity that belongs to the momentum, and sums of work keep what their rounding loses."""
     drift = simulate(build("paper_forward", [*BODY, *vibrating(tmp_path, 1000)])).energy_drift
     assert drift < 1e-14  # measured 4e-16; 8e-14 before
+
+
+@pytest.mark.serial
+def test_a_body_that_comes_to_rest_runs_on() -> None:
+    """Where the squares of its velocities vanish, p'M p may be zero for an r'y that is not."""
+    system = build("paper_forward", ["tissue.cells=[4, 4]"]).system
+    midpoint, rng = TissueMidpoint(system, 1e-2, "cholesky"), np.random.default_rng(0)
+    for size in np.logspace(-157, -151, 120):
+        state = state_on(size * rng.standard_normal(2 * system.layout.n_local), system)
+        midpoint.start(state)
+        state.v.array_w[:] *= 1 + 1e-8 * rng.random(system.layout.n_local)
+        restore_velocity(midpoint, state)
+        assert np.isfinite(state.array).all()
 
 
 @pytest.mark.ranks
