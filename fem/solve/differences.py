@@ -16,9 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from softgrasp.fem.compiled import functions
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc, to_scipy
 from softgrasp.fem.solve.cholesky import Dissection
 
@@ -29,6 +31,19 @@ SOURCE = Path(__file__).with_name("products.c")
 def product_code() -> Any:
     """The functions of `products.c`, or None with a warning where there is no compiler."""
     return functions(SOURCE, "the balance of energy loses digits on flat cells and near nu = 0.5")
+
+
+def require_same_code(comm: MPI.Intracomm) -> None:
+    """Refuse ranks of which some have compiled code and some have none: their numbers and messages differ. Collective.
+
+    Raises SolverError: it is so.
+    """
+    without = [rank for rank, has in enumerate(comm.allgather(product_code() is not None)) if not has]
+    if 0 < len(without) < comm.size:
+        raise SolverError(
+            f"rank {without[0]} finds neither a C compiler nor what others have compiled; install one on every machine, "
+            "name it in CC, or let XDG_CACHE_HOME be a folder that all of them can read and write"
+        )
 
 
 def address(array: Any) -> Any:

@@ -13,7 +13,7 @@ from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, rows_on_all, whole_copy
 from softgrasp.fem.solve.cholesky import NodeOrder, dissect
-from softgrasp.fem.solve.differences import Differences, minus_twice
+from softgrasp.fem.solve.differences import Differences, minus_twice, require_same_code
 from softgrasp.fem.system import BlockSystem
 
 
@@ -68,8 +68,11 @@ def replicated_operators(
     Args:
         S: matrix of the step, consumed.
         ordered: in the order of elimination; all rows then.
+
+    Raises SolverError: some ranks have compiled code and some have none.
     """
     layout, D = system.layout, system.damping.matrix
+    require_same_code(layout.comm)
     beside = () if D is None else (D, system.M_ee)
     first, last = layout.start, layout.start + layout.n_local
     if not (whole or ordered):
