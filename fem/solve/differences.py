@@ -41,8 +41,8 @@ def require_same_code(comm: MPI.Intracomm) -> None:
     without = [rank for rank, has in enumerate(comm.allgather(product_code() is not None)) if not has]
     if 0 < len(without) < comm.size:
         raise SolverError(
-            f"rank {without[0]} finds neither a C compiler nor what others have compiled; install one on every machine, "
-            "name it in CC, or let XDG_CACHE_HOME be a folder that all of them can read and write"
+            f"rank {without[0]} finds neither a C compiler nor what others have compiled; install one on every "
+            "machine, name it in CC, or let XDG_CACHE_HOME be a folder that all of them can read and write"
         )
 
 

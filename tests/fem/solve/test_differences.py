@@ -17,7 +17,7 @@ from softgrasp.fem.solve.solvers import SolverName
 def test_ranks_with_and_without_a_compiler_are_refused(
     comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch, solver: SolverName
 ) -> None:
-    """With cg the last rank would wait for messages that the others do not send; with a factor its bits would differ."""
+    """With cg the last rank would wait for messages that no other sends; with a factor its bits would differ."""
     code = differences.product_code()
     monkeypatch.setattr(differences, "product_code", lambda: None if comm.rank == comm.size - 1 else code)
     system = build("paper_forward", ["tissue.cells=[4, 4]"], comm=comm).system
