@@ -63,8 +63,8 @@ def _write(model: CertifiedModel, group: h5py.Group) -> None:
     group["about"] = np.frombuffer(json.dumps(data).encode(), dtype=np.uint8)  # attributes end at 64 kB
     group["static"], group["mass"], group["compliance"] = norms.static, norms.mass, model.compliance
     if model.duals is not None:
-        for key, value in vars(model.duals.blocks).items():
-            group[f"duals/{key}"] = value
+        for key in ("K_mu", "K_lambda", "M", "G"):
+            group[f"duals/{key}"] = getattr(model.duals.blocks, key)
         group["duals/C"], group["duals/triangle"] = model.duals.C, model.duals.triangle
     drive, name = model.drive, "drive"
     while drive is not None:

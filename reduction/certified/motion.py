@@ -205,10 +205,18 @@ def modal_residual(
     slow, n_s, k = int(np.searchsorted(m.omega * dt, SLOW)), len(c), len(y)
     norms = norms.galerkin
     G, M, K = norms.columns("both", materials, 3)
-    own = K @ m.X
-    own -= M @ (m.X * m.omega**2)
-    columns = np.hstack([own[:, :slow], G - M @ (m.X @ m.g), own[:, slow:]])
-    static, mass = columns[: len(norms.static)], columns[len(norms.static) :, slow:]
+    hand, edge = G - M @ (m.X @ m.g), len(norms.static)
+
+    def remainder(rows: slice, modes: slice) -> Array:
+        """Residual of some modes in the rows of one triangle: (K - omega^2 M) X."""
+        X = m.X[:, modes]
+        own = K[rows] @ X
+        own -= M[rows] @ (X * m.omega[modes] ** 2)
+        return np.asarray(own)
+
+    above, below = slice(edge), slice(edge, None)
+    own, fast = remainder(above, slice(None)), remainder(below, slice(slow, None))
+    static, mass = np.hstack([own[:, :slow], hand[above], own[:, slow:]]), np.hstack([hand[below], fast])
     midpoints, steps = np.empty((n_s + k - slow, c.shape[1])), np.empty((n_s + k, y.shape[1]))
     midpoints[:n_s], steps[:slow] = c, y[:slow]
     np.add(y[slow:, 1:], y[slow:, :-1], out=midpoints[n_s:])

@@ -11,7 +11,7 @@ The same numbers as :func:`softgrasp.reduction.online.run` to rounding, in less 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg
@@ -55,6 +55,10 @@ class SecondOrder:
     K_lambda: Array  # stiffness at lambda = 1 Pa, mu = 0, (L, k, k)
     M: Array  # mass at rho = 1 kg/m^3, (L, k, k)
     G: Array  # coupling to the hand at rho = 1 kg/m^3, (L, k, n_s)
+    # of the last densities: these, the mass M = L L', L^-1, and both stiffnesses of every layer as L^-1 K L^-T
+    kept: list[tuple[tuple[float, ...], Array, Array, Array, Array]] = field(
+        default_factory=list, repr=False, compare=False
+    )
 
     @staticmethod
     def of(model: ReducedModel) -> SecondOrder:
@@ -72,13 +76,22 @@ class SecondOrder:
         Raises:
             ModelError: the reduced mass is not definite, as with linearly dependent columns.
         """
-        K, M = p.stiffness(self.K_mu, self.K_lambda), p.density(self.M)
         try:
-            squares, X = scipy.linalg.eigh(K, M, driver="gvd", check_finite=False)
+            M, inverse, K_mu, K_lambda = self._in_mass(p)
+            squares, Y = np.linalg.eigh(p.stiffness(K_mu, K_lambda))
         except np.linalg.LinAlgError as error:
             raise ModelError("the reduced mass is singular; its basis vectors are linearly dependent") from error
-        omega = np.sqrt(np.maximum(squares, 0.0))
+        X, omega = inverse.T @ Y, np.sqrt(np.maximum(squares, 0.0))
         return Modes(omega, X, M, X.T @ p.density(self.G), p.alpha if p.damped else 0.0, p.materials[0].beta)
+
+    def _in_mass(self, p: Parameters) -> tuple[Array, Array, Array, Array]:
+        """M, L^-1 and the stiffnesses in columns orthonormal in M, made once for parameters of the same densities."""
+        densities = tuple(m.dense for m in p.materials)
+        if not self.kept or self.kept[0][0] != densities:
+            M = p.density(self.M)
+            inverse = scipy.linalg.solve_triangular(np.linalg.cholesky(M), np.eye(len(M)), lower=True)
+            self.kept[:] = [(densities, M, inverse, *(inverse @ K @ inverse.T for K in (self.K_mu, self.K_lambda)))]
+        return self.kept[0][1:]
 
 
 def march(omega: Array, rate: Array, loads: Array, dt: float, start: Array | None = None) -> Array:
@@ -143,8 +156,8 @@ def _turned(omega: Array, loads: Array, dt: float, start: Array | None) -> Array
     states = np.empty((m, 2, steps + 1))
     states[:, :, 0] = 0.0 if start is None else start
     blocks = -(-(steps + 1) // STEPS)
-    angle = -2j * np.arctan(h * omega)
-    near, far = (np.exp(np.multiply.outer(angle, n)) for n in (np.arange(STEPS), STEPS * np.arange(blocks)))
+    angle = -2 * np.arctan(h * omega)
+    near, far = (_unit(np.multiply.outer(angle, n)) for n in (np.arange(STEPS), STEPS * np.arange(blocks)))
     gain = 1j * dt / (1 + 1j * h * omega)
     powers = np.empty((AT_ONCE, blocks, STEPS), dtype=complex)
     for first in range(0, m, AT_ONCE):
@@ -160,3 +173,10 @@ def _turned(omega: Array, loads: Array, dt: float, start: Array | None) -> Array
         z *= turn
         states[part, 0, 1:], states[part, 1, 1:] = z.real, z.imag
     return states
+
+
+def _unit(angle: Array) -> Array:
+    """exp(i angle), by cosine and sine, which are several times as fast as the complex exponential."""
+    result = np.empty(angle.shape, dtype=complex)
+    result.real, result.imag = np.cos(angle), np.sin(angle)
+    return result

@@ -88,7 +88,7 @@ def other_steps(*_: Any) -> None:
 
 
 def dependent(*_: Any) -> None:
-    one: Any = SimpleNamespace(stiffness=lambda *_: np.eye(2), density=lambda _: np.zeros((2, 2)))
+    one: Any = SimpleNamespace(materials=(), stiffness=lambda *_: np.eye(2), density=lambda _: np.zeros((2, 2)))
     SecondOrder(*np.zeros((4, 2, 2))).modes(one)
 
 
