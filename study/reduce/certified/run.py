@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
@@ -30,6 +31,7 @@ from softgrasp.study.report import Page
 from softgrasp.study.shell import Session, median_seconds
 
 FILE = "certified.h5"
+PAUSE = 2.0  # seconds between files of an unfinished model: a file takes as long as three points of the greedy
 
 
 def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
@@ -84,11 +86,14 @@ def _with_mesh(certified: CertifiedModel, model: Model, places: list[Materials])
 
 
 def _saver(bar: Progress, trainer: Trainer, file: Path, goal: float) -> Callable[[Greedy, CertifiedModel], None]:
-    """Called after every round: saves the model so far, and says how far its largest bound is on the way to a goal."""
-    task = bar.add_task("greedy", total=1.0)
+    """Called after every round: says how far its largest bound is on the way to a goal, and saves at intervals."""
+    task, saved = bar.add_task("greedy", total=1.0), time.monotonic()
 
     def after(state: Greedy, so_far: CertifiedModel) -> None:
-        save_certified(so_far, file)
+        nonlocal saved
+        if trainer.comm.bcast(time.monotonic() - saved >= PAUSE):
+            save_certified(so_far, file)
+            saved = time.monotonic()
         bounds = [r.bound for r in state.rounds if np.isfinite(r.bound)]
         if bounds and bounds[-1] < bounds[0]:
             share = np.log(bounds[0] / bounds[-1]) / np.log(bounds[0] / min(goal, bounds[-1] * 0.999))
