@@ -141,7 +141,7 @@ class TissueSolver:
         result = np.zeros(X.shape, order="F")
         some = np.flatnonzero(total(self.S.comm.tompi4py(), np.abs(X).sum(axis=0)) != 0)
         block = None
-        if isinstance(self.factor, OrderedFactor):  # each rank stores the whole factor
+        if isinstance(self.factor, OrderedFactor) and len(some) > 1:  # each rank has the whole factor for some of them
             block = self.factor.columns
         elif self.name == "mumps" and len(some) > 1 and not user_options(self.ksp.getOptionsPrefix()):
             block = partial(block_solves, self.ksp.getPC().getFactorMatrix(), self.S)

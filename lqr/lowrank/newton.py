@@ -5,6 +5,7 @@ A restart is one file a rank, and a manifest written last with the SHA-256 of ea
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,7 @@ class Iteration:
     # residual and shift of each solve, one dictionary each
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)  # time by stage [s]
+    saved: float = field(default_factory=time.monotonic)  # clock at the start, or at the last restart file [s]
 
 
 def fingerprint(plant: Plant) -> str:
@@ -154,6 +156,7 @@ class NewtonADI(LowRankSolver[ModalStart]):
     modes: int | None = None  # number of modes of the start; 0: the hand alone, None: by the damping
     checkpoint: Path | None = None  # folder for restart files, one per rank; an existing one is resumed
     checkpoint_every: int = 25  # solves between two restart files
+    checkpoint_after: float = 10.0  # time from the start, or the last restart file, before the next one [s]
 
     def prepare(self, plant: Plant) -> ModalStart:
         """Gain K_0 and first shifts. Collective."""
@@ -208,11 +211,17 @@ class NewtonADI(LowRankSolver[ModalStart]):
             if relative <= STOP * self.tol or lyapunov <= forcing:
                 return relative
             if self.checkpoint is not None and sweep.steps % self.checkpoint_every == 0:
-                save_state(self.checkpoint, plant, state, sweep)
+                self._save(self.checkpoint, plant, state, sweep)
         raise SolverError(
             f"newton_adi: relative residual {relative:.1e} after {self.max_solves} solves of one sweep, tolerance "
             f"{self.tol:.0e}; add damping, or use {MODAL_KEY}, which leaves the high modes alone"
         )
+
+    def _save(self, folder: Path, plant: Plant, state: Iteration, sweep: AdiSweep) -> None:
+        """Write a restart file unless the last one, or the start, is too near. Collective."""
+        if plant.comm.bcast(time.monotonic() - state.saved >= self.checkpoint_after):
+            save_state(folder, plant, state, sweep)
+            state.saved = time.monotonic()
 
 
 def _advance(plant: Plant, sweep: AdiSweep, state: Iteration) -> None:

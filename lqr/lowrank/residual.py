@@ -9,14 +9,19 @@ and with the thin QR factorisation U = q r the 2-norm is the largest |eigenvalue
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+import scipy.linalg
 from mpi4py import MPI
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root, times_columns
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 ROWS = 4_000  # rows of U that are reduced at a time
+BLOCK = 32  # columns whose reflections LAPACK applies at once
 
 
 def residual(problem: RiccatiProblem, Z: Block) -> float:
@@ -75,8 +80,19 @@ def _fill_tissue(problem: RiccatiProblem, Z: Block, top: Array, bottom: Array) -
 
 def _triangular(comm: MPI.Intracomm, U: Array) -> Array:
     """R of the thin QR factorisation of rows spread over the ranks, right on rank 0. Collective."""
-    r = np.linalg.qr(U[:ROWS], mode="r")
+    r = _reduced([U[:ROWS]])
     for first in range(ROWS, len(U), ROWS):
-        r = np.linalg.qr(np.vstack([r, U[first : first + ROWS]]), mode="r")
+        r = _reduced([r, U[first : first + ROWS]])
     gathered = comm.gather(r) if comm.size > 1 else None
-    return np.asarray(r if gathered is None else np.linalg.qr(np.vstack(gathered), mode="r"))
+    return r if gathered is None else _reduced(gathered)
+
+
+def _reduced(parts: Sequence[Array]) -> Array:
+    """R of the QR factorisation of a stack of rows, by SciPy's LAPACK, as NumPy's takes 1.5 times as long."""
+    stack = np.empty((sum(map(len, parts)), parts[0].shape[1]), order="F")
+    np.concatenate(parts, out=stack)
+    least = min(stack.shape)
+    factored, _, _, failed = scipy.linalg.lapack.dgeqrf(stack, lwork=BLOCK * stack.shape[1], overwrite_a=1)
+    if failed:
+        raise SolverError(f"the QR factorisation of a residual was refused by LAPACK (info {failed})")
+    return np.triu(factored[:least])

@@ -13,7 +13,7 @@ from slepc4py import SLEPc
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc, from_options, total
 from softgrasp.fem.shown import Shown
-from softgrasp.fem.solve.solvers import make_solver
+from softgrasp.fem.solve.solvers import factor_on_every_rank, make_solver
 from softgrasp.fem.solve.stiffness import shared_factor, static_solver
 from softgrasp.fem.system import dynamic_stiffness
 from softgrasp.lqr.dense.modal import modes_of_plant
@@ -201,7 +201,9 @@ class OpenLoop:
         self.system, self.layout, self.comm = problem.system, problem.layout, problem.layout.comm
         self.drag = self.system.damping.drag
         name = static_solver(self.system)
-        self.solver = make_solver(dynamic_stiffness(self.system, shift), name, self.layout, PREFIX, rtol=1e-12)
+        subtrees = not factor_on_every_rank(self.layout, name, "auto", linear=True)
+        S = dynamic_stiffness(self.system, shift)
+        self.solver = make_solver(S, name, self.layout, PREFIX, rtol=1e-12, subtrees=subtrees)
         system, sigma, n_s = self.system, shift, self.layout.n_s
         hand = sigma**2 * problem.M_s
         if system.two_way:

@@ -86,7 +86,7 @@ def no_space(*_: Any) -> None:
 
 def full_disk(folder: Path, patch: pytest.MonkeyPatch) -> None:
     patch.setattr(newton, "write_manifest", no_space)
-    newton.NewtonADI(checkpoint=folder, checkpoint_every=1).solve(problem())
+    newton.NewtonADI(checkpoint=folder, checkpoint_every=1, checkpoint_after=0.0).solve(problem())
 
 
 def other_density(*_: Any) -> None:

@@ -11,7 +11,9 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene
+from softgrasp.fem.solve import costs
 from softgrasp.fem.solve.stiffness import sharing_factors
+from softgrasp.fem.solve.subtrees import SplitFactor
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.design.scene import with_control
 from softgrasp.lqr.lowrank.modal_start import modal_start
@@ -21,7 +23,7 @@ from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.riccati import solve
 from softgrasp.lqr.spectrum import certificate
-from softgrasp.lqr.spectrum.certificate import abscissa
+from softgrasp.lqr.spectrum.certificate import OpenLoop, abscissa
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
 from softgrasp.lqr.spectrum.tail import TailBound
 from tests.helpers.models import LAYERS, make_scene
@@ -162,3 +164,23 @@ def test_gains_of_one_circle_share_a_factor(monkeypatch: pytest.MonkeyPatch) -> 
     alone = [abscissa(problem, K) for K in gains]
     assert len(made) == 3
     assert [a.value for a in alone] == [a.value for a in shared]
+
+
+@pytest.mark.ranks(3)
+@pytest.mark.parametrize("changes", [KELVIN, SPACE])
+def test_subtrees_on_ranks_find_the_same_poles(changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, made = small(changes, {"tissue": {"cells": [8, 16]}}), list[bool]()
+    K = Gain.of_block(gain(problem))
+    whole = abscissa(problem, K)
+    monkeypatch.setattr(costs, "SUBTREES_FROM", 0)
+    make = OpenLoop.__init__
+
+    def kept(self: OpenLoop, *args: Any) -> None:
+        make(self, *args)
+        made.append(isinstance(self.solver.factor, SplitFactor))
+
+    monkeypatch.setattr(OpenLoop, "__init__", kept)
+    split = abscissa(problem, K)
+    assert made == [problem.layout.comm.size > 1]
+    assert split.certified == whole.certified
+    assert abs(split.value - whole.value) < 1e-8  # tolerance 1e-9 of poles of size 10

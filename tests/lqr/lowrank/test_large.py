@@ -221,7 +221,7 @@ def _stop_at(count: int) -> Callable[[dict[str, float]], None]:
 def test_resume_goes_on_where_it_stopped(mpi_tmp_path: Path) -> None:
     problem, folder = problem_of("one_way"), mpi_tmp_path / "restart"
     with pytest.raises(_StopError):
-        NewtonADI(checkpoint=folder, checkpoint_every=5, progress=_stop_at(23)).solve(problem)
+        NewtonADI(checkpoint=folder, checkpoint_every=5, checkpoint_after=0.0, progress=_stop_at(23)).solve(problem)
     seen: list[float] = []
     found = NewtonADI(checkpoint=folder, progress=lambda entry: seen.append(entry["solve"])).solve(problem)
     assert seen[0] == 21
@@ -237,7 +237,7 @@ def test_foreign_restart_file_is_refused(mpi_tmp_path: Path) -> None:
     for name, mine, foreign in (("hand", problem_of("one_way"), problem_of("two_way")), ("layers", layers, other)):
         folder = mpi_tmp_path / name
         with pytest.raises(_StopError):
-            NewtonADI(checkpoint=folder, checkpoint_every=5, progress=_stop_at(8)).solve(mine)
+            NewtonADI(checkpoint=folder, checkpoint_every=5, checkpoint_after=0.0, progress=_stop_at(8)).solve(mine)
         with pytest.raises(CheckpointError, match="another control problem"):
             NewtonADI(checkpoint=folder).solve(foreign)
 
@@ -245,7 +245,7 @@ def test_foreign_restart_file_is_refused(mpi_tmp_path: Path) -> None:
 def test_every_damage_of_a_restart_file_of_newton_is_refused(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     problem, folder = problem_of("one_way"), mpi_tmp_path / "restart"
     with pytest.raises(_StopError):
-        NewtonADI(checkpoint=folder, checkpoint_every=5, progress=_stop_at(8)).solve(problem)
+        NewtonADI(checkpoint=folder, checkpoint_every=5, checkpoint_after=0.0, progress=_stop_at(8)).solve(problem)
     plant, random, nothing = Plant(problem), np.random.default_rng(3), np.zeros((0, 0))
     for path in (folder / f"newton-solve5-rank{comm.size - 1}.npz", folder / "newton.json"):
         good = path.read_bytes()

@@ -273,7 +273,7 @@ def add_gains(made: dict[str, Kind], folder: Callable[[str], Path]) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        NewtonADI(checkpoint=stopped, checkpoint_every=4, progress=stop).solve(problem)
+        NewtonADI(checkpoint=stopped, checkpoint_every=4, checkpoint_after=0.0, progress=stop).solve(problem)
 
     def resumed(at: Path) -> Any:
         found = NewtonADI(checkpoint=at).solve(problem)
