@@ -92,6 +92,8 @@ def _reduced(parts: Sequence[Array]) -> Array:
     stack = np.empty((sum(map(len, parts)), parts[0].shape[1]), order="F")
     np.concatenate(parts, out=stack)
     least = min(stack.shape)
+    if not least:  # a rank without nodes, which LAPACK refuses
+        return stack
     factored, _, _, failed = scipy.linalg.lapack.dgeqrf(stack, lwork=BLOCK * stack.shape[1], overwrite_a=1)
     if failed:
         raise SolverError(f"the QR factorisation of a residual was refused by LAPACK (info {failed})")

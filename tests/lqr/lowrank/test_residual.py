@@ -10,7 +10,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.dense.modal import DenseRiccati, dense_residual, relative_space
 from softgrasp.lqr.design.scene import problem as make_problem
-from softgrasp.lqr.lowrank.residual import residual
+from softgrasp.lqr.lowrank.residual import _triangular, residual
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from tests.helpers.models import LAYERS, make_scene
@@ -63,3 +63,12 @@ def test_residual_leaves_its_input_alone() -> None:
     copies = [x.copy() for x in (found.hand, found.tall)]
     residual(problem, found)
     assert all(np.array_equal(a, b) for a, b in zip(copies, (found.hand, found.tall), strict=True))
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("rows", [0, 2, 7])
+def test_triangle_of_rows_that_other_ranks_lack(comm: MPI.Intracomm, rows: int) -> None:
+    U = np.random.default_rng(4).standard_normal((rows, 3))
+    R = _triangular(comm, U if comm.rank == comm.size - 1 else U[:0])
+    if comm.rank == 0:
+        np.testing.assert_allclose(R.T @ R, U.T @ U, rtol=0, atol=1e-14)  # sums of 7 products of numbers near 1
