@@ -39,17 +39,20 @@ def errors(full: Any, run: Any, V: Any, comm: MPI.Intracomm) -> tuple[float, flo
 
 
 @pytest.mark.serial
-def test_thirty_columns_repeat_a_motion_they_were_not_made_for() -> None:
-    rom = contact_model(landing(MADE, *LONG))  # 15 by 30 cells, as the scene ships
-    full = simulate(landing(OTHER, *LONG))
+@pytest.mark.parametrize(("motion", "modes", "rows", "depth"), [(OTHER, 10, None, 1e-14), (STRAIGHT, 18, 12, 1e-3)])
+def test_thirty_columns_repeat_a_motion_they_were_not_made_for(
+    motion: str, modes: int, rows: int | None, depth: float
+) -> None:
+    rom = contact_model(landing(MADE, *LONG), modes, rows=rows)  # 15 by 30 cells, as the scene ships
+    full = simulate(landing(motion, *LONG))
     run = rom.run(full.q_s, full.v_s, rom.dt)
     z, force = errors(full, run, rom.V, MPI.COMM_SELF)
     assert rom.N <= 30
     assert full.contact is not None
     assert (full.contact.touching > 0).mean() > 0.2
-    assert z < 1e-3  # asked for; measured 8.4e-4
-    assert force < 1e-2  # asked for; measured 3.9e-3
-    assert run.gap.min() > -1e-14  # of a body of 2 m
+    assert z < 1e-3  # asked for; measured 8.4e-4 and 4.0e-4
+    assert force < 1e-2  # asked for; measured 3.9e-3 and 5.2e-3; 1.06e-2 straight down with rows of nodes
+    assert run.gap.min() > -depth  # of a body of 2 m; between hat functions nodes sink in
     # as far as z from the full run, relative to the deformation
     assert np.abs(run.outputs - full.outputs).max() < 2e-3 * np.abs(full.outputs - full.outputs_rigid).max()
 
