@@ -35,7 +35,7 @@ def symmetric_part(comm: MPI.Intracomm, first: int, indptr: NDArray[Any], column
     result[places.data] += blocks[places.tocsc().data].transpose(0, 2, 1)
     if comm.size > 1:
         other, starts = np.setdiff1d(np.arange(len(columns)), mine), np.array(comm.allgather(first))
-        bits = blocks[other].reshape(len(other), -1).view(np.int64)
+        bits = blocks[other].reshape(len(other), blocks.shape[1] * blocks.shape[2]).view(np.int64)
         numbers = np.column_stack([row[other] + first, columns[other], bits])
         owner = np.searchsorted(starts, columns[other], side="right") - 1
         found = to_ranks(comm, owner, numbers)

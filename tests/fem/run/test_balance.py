@@ -9,6 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
+from softgrasp.fem.model.symmetric import symmetric_part
 from softgrasp.fem.petsc import rows_on_all
 from softgrasp.fem.run.energy import wide_product
 from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
@@ -63,6 +64,15 @@ def test_stiffness_is_symmetric_in_its_bits(comm: MPI.Intracomm, order: int) -> 
     for A in (system.K_ee, system.M_ee):
         whole = gather_matrix(system.layout, A)
         assert abs(whole - whole.T).max() == 0
+
+
+@pytest.mark.ranks
+def test_symmetric_part_where_other_ranks_have_no_rows(comm: MPI.Intracomm) -> None:
+    here, n, d = comm.rank == comm.size - 1, 3, 2
+    A = np.random.default_rng(5).standard_normal((n, n, d, d))
+    rows = n if here else 0
+    found = symmetric_part(comm, 0, n * np.arange(rows + 1), np.tile(np.arange(n), rows), A[:rows].reshape(-1, d, d))
+    assert np.array_equal(found, ((A + A.transpose(1, 0, 3, 2)) / 2)[:rows].reshape(-1, d, d))
 
 
 @pytest.mark.ranks
