@@ -204,6 +204,19 @@ def driven_by_root(
     return on_root(comm, lead)
 
 
+def folded[R](comm: MPI.Intracomm, part: R, fold: Callable[[R, R], R]) -> R:
+    """Parts of all ranks, folded two at a time in a tree, in the order of the ranks; right on rank 0. Collective."""
+    step = 1
+    while step < comm.size:
+        place = comm.rank % (2 * step)
+        if place == step:
+            comm.send(part, comm.rank - step)
+        elif place == 0 and comm.rank + step < comm.size:
+            part = fold(part, comm.recv(source=comm.rank + step))
+        step *= 2
+    return part
+
+
 def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:
     """Run small dense work on rank 0 and broadcast what it returns or raises. Collective."""
     answer: tuple[Any, Exception | None] = (None, None)

@@ -16,7 +16,7 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, on_root, times_columns
+from softgrasp.fem.petsc import Array, folded, on_root, times_columns
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
@@ -83,8 +83,7 @@ def _triangular(comm: MPI.Intracomm, U: Array) -> Array:
     r = _reduced([U[:ROWS]])
     for first in range(ROWS, len(U), ROWS):
         r = _reduced([r, U[first : first + ROWS]])
-    gathered = comm.gather(r) if comm.size > 1 else None
-    return r if gathered is None else _reduced(gathered)
+    return folded(comm, r, lambda upper, lower: _reduced([upper, lower]))
 
 
 def _reduced(parts: Sequence[Array]) -> Array:

@@ -25,7 +25,7 @@ from mpi4py import MPI
 from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError, raise_on_all_ranks
-from softgrasp.fem.petsc import Array, PETSc, from_options, on_root, total
+from softgrasp.fem.petsc import Array, PETSc, folded, from_options, on_root, total
 from softgrasp.reduction.bases.aside import aside
 from softgrasp.reduction.bases.states import BasisError
 
@@ -185,7 +185,7 @@ def _flat(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
 
 
 def triangle(comm: MPI.Intracomm, X: Array, top: Array | None = None) -> Array:
-    """R of X = Q R, without Q, by QR of row blocks, then of the stacked triangles on rank 0. Collective.
+    """R of X = Q R, without Q, by QR of row blocks, then of triangles of two ranks at a time. Collective.
 
     Args:
         X: local rows (n_local, k).
@@ -194,10 +194,8 @@ def triangle(comm: MPI.Intracomm, X: Array, top: Array | None = None) -> Array:
     R = np.zeros((0, X.shape[1])) if top is None or comm.rank else top
     for i in range(0, len(X), BLOCK_ROWS):
         R = np.linalg.qr(np.vstack([R, X[i : i + BLOCK_ROWS]]), mode="r")
-    if comm.size == 1:
-        return R
-    parts = comm.gather(R)
-    return on_root(comm, lambda: np.linalg.qr(np.vstack(parts or []), mode="r"))
+    R = folded(comm, R, lambda upper, lower: np.linalg.qr(np.vstack([upper, lower]), mode="r"))
+    return on_root(comm, lambda: R)
 
 
 def _gram(comm: MPI.Intracomm, X: Array, k: int | None) -> tuple[Array, Array]:

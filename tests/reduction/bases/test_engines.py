@@ -8,7 +8,7 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import on_root, total
-from softgrasp.reduction.bases.engines import ENGINES, EngineName, factor, magnitude, small_svd
+from softgrasp.reduction.bases.engines import ENGINES, EngineName, factor, magnitude, small_svd, triangle
 from softgrasp.reduction.bases.states import BasisError, Columns
 from softgrasp.reduction.bases.svd_like import balanced, svd_like_pairs, symplectic_form
 from softgrasp.reduction.bases.truncation import Part, Truncation, counts_of, needed
@@ -83,6 +83,15 @@ def test_deficient_snapshots_have_the_right_rank(comm: MPI.Intracomm, engine: En
     assert close(s[:rank] * f.scale, true[:rank]) < 1e-13  # well conditioned
     U = whole(comm, f.Q @ u[:, :rank])
     assert close(U @ (U.T @ full), full) < 1e-12  # same span
+
+
+@pytest.mark.parametrize("rows", [3, 40])  # fewer and more than columns on a rank of three
+def test_triangle_folds_the_ranks_in_a_tree(comm: MPI.Intracomm, rows: int) -> None:
+    X, top = decaying(rows * 3, 7, 3.0), np.ones((2, 7))
+    R, expected = triangle(comm, rows_of(comm, X), top), np.linalg.qr(np.vstack([top, X]), mode="r")
+    assert same_everywhere(comm, R)
+    # triangles are equal but for the signs of rows; backward errors of 1e-16 grow by the condition 1e3
+    assert np.abs(np.abs(R) - np.abs(expected)).max() < 1e-12
 
 
 @pytest.mark.parametrize("engine", ENGINES)
