@@ -5,8 +5,8 @@ of the views of the largest model of a family, and snapshots X = Q C + rest,
 
     |X - V Y|_F^2 = |rest|_F^2 + |C - R Y|_F^2
 
-for every model whose columns lie in the span of Q: no cancellation, and the snapshots are read twice for all models
-together instead of several times for each.
+for every model whose columns lie in the span of Q: no cancellation, and the snapshots are read once for all views and
+sizes of a family, and for all families that :func:`prepare` is given together.
 """
 
 from __future__ import annotations
@@ -143,35 +143,27 @@ class Span:
         return ratio(self.rest + squares(left), self.square)
 
 
-def span_of(view: View, V: Array, system: BlockSystem, snapshots: Snapshots) -> Span:
-    """Factor the columns V of a view and put the snapshots into them. Collective.
+def spans_in(bases: Sequence[tuple[View, Array]], system: BlockSystem, snapshots: Snapshots) -> list[Span]:
+    """Snapshots in orthonormal columns Q of their views, local rows: the snapshots are read once for all. Collective.
 
-    Raises:
-        BasisError: V is zero or not finite.
-        SolverError: the factorisation fails.
+    ``bases``: view and Q of each.
     """
-    return span_in(view, factor(system.layout.comm, V).Q, system, snapshots)
-
-
-def span_in(view: View, Q: Array, system: BlockSystem, snapshots: Snapshots) -> Span:
-    """Snapshots in orthonormal columns Q of a view, local rows, some at a time. Collective."""
-    return spans_in(view, [Q], system, snapshots)[0]
-
-
-def spans_in(view: View, bases: Sequence[Array], system: BlockSystem, snapshots: Snapshots) -> list[Span]:
-    """As :func:`span_in` for several Q: the snapshots are read once for all. Collective."""
     comm, n = system.layout.comm, system.layout.n_local
     C: list[list[Array]] = [[] for _ in bases]
-    square, rests = 0.0, np.zeros(len(bases))
+    rests, whole = np.zeros(len(bases)), dict.fromkeys((view for view, _ in bases), 0.0)
     for b in column_blocks(snapshots.Z.shape[1]):
-        Z = snapshots.Z[:, b]
-        X = state_rows(view, system, Z[:n], Z[n:], snapshots.q_s[:, b], snapshots.v_s[:, b])
-        square += squares(X)
-        for i, Q in enumerate(bases):
+        Z, hand = snapshots.Z[:, b], (snapshots.q_s[:, b], snapshots.v_s[:, b])
+        seen = {view: state_rows(view, system, Z[:n], Z[n:], *hand) for view in whole}
+        for view, X in seen.items():
+            whole[view] += squares(X)
+        for i, (view, Q) in enumerate(bases):
+            X = seen[view]
             C[i].append(total(comm, Q.T @ X))
             rests[i] += squares(X - Q @ C[i][-1])  # rounding leaves eps |X|, far below the error of any model
-    square, *rest = total(comm, np.array([square, *rests])).tolist()
-    return [Span(comm, Q, np.hstack(c), left, square) for Q, c, left in zip(bases, C, rest, strict=True)]
+    left = total(comm, np.array([*whole.values(), *rests])).tolist()
+    square = dict(zip(whole, left, strict=False))
+    every = zip(bases, C, left[len(whole) :], strict=True)
+    return [Span(comm, Q, np.hstack(c), rest, square[view]) for (view, Q), c, rest in every]
 
 
 @dataclass(frozen=True)
@@ -192,9 +184,7 @@ class ModelComparison:
 
         Raises ModelError: the model has no basis on the mesh.
         """
-        if view not in self._spans:
-            V = shown_rows(view, self.model, self.small, self.system)
-            self._spans[view] = span_of(view, V, self.system, self.snapshots)
+        prepare([self], [view])
         return self._spans[view]
 
     def shown(self, view: View, model: ReducedModel, small: EnergySystem) -> Array:
@@ -221,6 +211,7 @@ class ModelComparison:
 
     def errors(self, model: ReducedModel, small: EnergySystem, run: ReducedTrajectory) -> ModelErrors:
         """All errors of a run; see :meth:`state_error`. Collective."""
+        prepare([self], VIEWS)
         velocities, momenta, deformation = (self.state_error(view, model, small, run) for view in VIEWS)
         error = np.abs(small.energy(run.x[self.snapshots.steps]) - self.energy).max(initial=0.0)
         peak = float(self.energy.max(initial=0.0))
@@ -232,6 +223,25 @@ class ModelComparison:
         Raises ModelError: the model is larger than that.
         """
         return self.span(view).projection_error(self.shown(view, model, small) @ with_hand(small))
+
+
+def prepare(comparisons: Sequence[ModelComparison], views: Sequence[View]) -> None:
+    """Spans of the largest models' views that are not there yet, by one reading of the run that all have. Collective.
+
+    Raises:
+        ModelError: a model has no basis on the mesh.
+        BasisError: its columns are zero or not finite.
+        SolverError: the factorisation fails.
+    """
+    missing = [(each, view) for each in comparisons for view in views if view not in each._spans]
+    if not missing:
+        return
+    first = comparisons[0]
+    comm, bases = first.system.layout.comm, list[tuple[View, Array]]()
+    for each, view in missing:
+        bases.append((view, factor(comm, shown_rows(view, each.model, each.small, each.system)).Q))
+    for (each, view), span in zip(missing, spans_in(bases, first.system, first.snapshots), strict=True):
+        each._spans[view] = span
 
 
 def all_at(
@@ -248,11 +258,10 @@ def all_at(
         system, snapshots, energy: as in :class:`ModelComparison`, of that run.
     """
     spans: list[dict[View, Span]] = [{} for _ in known]
-    for view in VIEWS:
-        having = [i for i, each in enumerate(known) if view in each._spans]
-        found = spans_in(view, [known[i]._spans[view].Q for i in having], system, snapshots) if having else []
-        for i, span in zip(having, found, strict=True):
-            spans[i][view] = span
+    every = [(i, view, span.Q) for i, each in enumerate(known) for view, span in each._spans.items()]
+    found = spans_in([(view, Q) for _, view, Q in every], system, snapshots) if every else []
+    for (i, view, _), span in zip(every, found, strict=True):
+        spans[i][view] = span
     pairs = zip(known, places, spans, strict=True)
     return [ModelComparison(each.model, small, system, snapshots, energy, own) for each, small, own in pairs]
 

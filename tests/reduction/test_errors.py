@@ -11,7 +11,8 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.reduction.errors import VIEWS, ModelComparison, Span, full_energy
+from softgrasp.reduction import errors as module
+from softgrasp.reduction.errors import VIEWS, ModelComparison, Span, full_energy, prepare
 from softgrasp.reduction.online import run
 from softgrasp.reduction.replay import full_run, replay_linear
 from softgrasp.reduction.system import ModelError
@@ -141,3 +142,32 @@ def test_what_a_model_shows_is_put_into_the_span_once(comm: MPI.Intracomm, monke
                 expected = found, least
         assert found.error == pytest.approx(expected[0].error, rel=1e-10)  # sums in another order
         assert least == pytest.approx(expected[1], rel=1e-8)  # least squares, condition 1e4
+
+
+def test_snapshots_are_read_once_for_all_views_sizes_and_families(
+    comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = model_of(comm)
+    snapshots: Any = simulate(model).snapshots
+    energy = full_energy(model.system, snapshots.Z)
+    large = symplectic_basis(model.system.layout, 5, "relative", True)
+    roms = [reduced(model, leading(large, k)) for k in (3, 5)]
+    readings: list[int] = []
+    blocks = module.column_blocks
+    monkeypatch.setattr(module, "column_blocks", lambda m: readings.append(m) or blocks(m))
+    # sizes of one family: states, momenta, deformation and what a basis of each size can show
+    family = ModelComparison(roms[1], roms[1].at(), model.system, snapshots, energy)
+    for rom in roms:
+        small = rom.at()
+        family.errors(rom, small, run(small, step_of(model), force_of(model), allow_unstable=True))
+        family.projection_error("velocities", rom, small)
+    assert len(readings) == 1
+    # two families together, and the numbers of each alone
+    two = [ModelComparison(rom, rom.at(), model.system, snapshots, energy) for rom in roms]
+    prepare(two, ["deformation"])
+    assert len(readings) == 2
+    for rom, together in zip(roms, two, strict=True):
+        found = together.projection_error("deformation", rom, rom.at())
+        # the largest model of the other family, least squares of condition 1e4
+        assert found == pytest.approx(family.projection_error("deformation", rom, rom.at()), rel=1e-8)
+    assert len(readings) == 2

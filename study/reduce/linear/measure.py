@@ -17,7 +17,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.reduction import Basis, ModelComparison, ModelError, ReducedModel, Truncation, project_scene, registry
 from softgrasp.reduction.bases.aside import cores, in_threads
 from softgrasp.reduction.bases.states import BasisError, States, states_of, whole_states
-from softgrasp.reduction.errors import all_at
+from softgrasp.reduction.errors import all_at, prepare
 from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
@@ -271,7 +271,9 @@ Family = tuple[str, bool]
 def families(full: FullRun, models: Sequence[TestedModel]) -> dict[Family, ModelComparison]:
     """Comparison with the full run by family of models, made with the largest model of each. Collective."""
     largest = {(m.method.key, m.several): m.model for m in sorted(models, key=lambda m: m.model.N)}
-    return {family: comparison_of(model, full) for family, model in largest.items()}
+    made = {family: comparison_of(model, full) for family, model in largest.items()}
+    prepare(list(made.values()), ["deformation"])
+    return made
 
 
 def moved(known: dict[Family, ModelComparison], full: FullRun) -> dict[Family, ModelComparison]:
