@@ -61,25 +61,28 @@ class Cost:
     messages: float = 0.0  # messages of one pass that wait for each other, over the binary logarithm of the ranks [1]
 
 
-# By solver, dimension and whether the order is 2 or more. Messages of iterations are counted on 2 to 8 ranks, those of
-# a factor guessed. Times of direct solvers follow their entries: n log n and
-# n^1.5 in 2D, n^(4/3) and n^2 in 3D, but for the caches; memory of factors is nnz(L) of factor_bytes. With 4e5 unknowns
-# in 2D cholesky takes 4.9 s and 60 ms, MUMPS 2.7 s and 121 ms; beyond it was not measured.
-COSTS: dict[tuple[SolverName, int, bool], Cost] = {
-    ("cholesky", 2, False): Cost((0.67, 1.5), (0.0127, 1.1), (800, 0.1), 5e5),
-    ("cholesky", 2, True): Cost((0.9, 1.5), (0.017, 1.1), (1000, 0.1), 5e5),
-    ("mumps", 2, False): Cost((0.40, 1.25), (0.030, 0.97), (1000, 0.1), 4e6, fixed=0.033, messages=100),
-    ("mumps", 2, True): Cost((0.55, 1.25), (0.035, 0.97), (1250, 0.1), 4e6, fixed=0.033, messages=100),
-    ("cg", 2, False): Cost((0.25, 1.0), (0.006, 1.12), (600, 0.0), np.inf, iterations=(9, 9.6), messages=22),
-    ("cg", 2, True): Cost((0.6, 1.0), (0.02, 1.0), (1000, 0.0), np.inf, iterations=(16, 16), messages=22),
-    ("stars", 2, True): Cost((1.2, 1.0), (0.02, 1.0), (900, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
-    ("cholesky", 3, False): Cost((37.0, 2.0), (0.11, 1.5), (13_000, 1 / 3), 2e4),
-    ("cholesky", 3, True): Cost((37.0, 2.0), (0.11, 1.5), (13_000, 1 / 3), 2e4),
-    ("mumps", 3, False): Cost((13.1, 2.0), (0.158, 1.5), (10_600, 1 / 3), 3e5, fixed=0.033, messages=100),
-    ("mumps", 3, True): Cost((12.8, 2.0), (0.144, 4 / 3), (10_600, 1 / 3), 3e5, fixed=0.033, messages=100),
-    ("cg", 3, False): Cost((0.8, 1.0), (0.022, 1.0), (900, 0.0), np.inf, iterations=(9, 9.6), messages=22),
-    ("cg", 3, True): Cost((2.0, 1.0), (0.080, 1.0), (700, 0.0), np.inf, iterations=(16, 16), messages=22),
-    ("stars", 3, True): Cost((2.8, 1.17), (0.044, 1.2), (3200, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
+# By solver, dimension and the order from which it holds. Messages of iterations are counted on 2 to 8 ranks, those of
+# a factor guessed. Times of direct solvers follow their entries: n log n and n^1.5 in 2D, n^(4/3) and n^2 in 3D, but
+# for the caches; memory of factors is nnz(L) of factor_bytes. With 4e5 unknowns in 2D cholesky takes 4.9 s and 60 ms,
+# MUMPS 2.7 s and 121 ms; beyond it was not measured. What iterates on P3 was measured at 9e3 and 2e4 unknowns, where
+# factors take the time of P2 to 1.2; its memory follows the entries.
+COSTS: dict[tuple[SolverName, int, int], Cost] = {
+    ("cholesky", 2, 1): Cost((0.67, 1.5), (0.0127, 1.1), (800, 0.1), 5e5),
+    ("cholesky", 2, 2): Cost((0.9, 1.5), (0.017, 1.1), (1000, 0.1), 5e5),
+    ("mumps", 2, 1): Cost((0.40, 1.25), (0.030, 0.97), (1000, 0.1), 4e6, fixed=0.033, messages=100),
+    ("mumps", 2, 2): Cost((0.55, 1.25), (0.035, 0.97), (1250, 0.1), 4e6, fixed=0.033, messages=100),
+    ("cg", 2, 1): Cost((0.25, 1.0), (0.006, 1.12), (600, 0.0), np.inf, iterations=(9, 9.6), messages=22),
+    ("cg", 2, 2): Cost((0.6, 1.0), (0.02, 1.0), (1000, 0.0), np.inf, iterations=(16, 16), messages=22),
+    ("stars", 2, 2): Cost((1.2, 1.0), (0.02, 1.0), (900, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
+    ("cholesky", 3, 1): Cost((37.0, 2.0), (0.11, 1.5), (13_000, 1 / 3), 2e4),
+    ("cholesky", 3, 2): Cost((37.0, 2.0), (0.11, 1.5), (13_000, 1 / 3), 2e4),
+    ("mumps", 3, 1): Cost((13.1, 2.0), (0.158, 1.5), (10_600, 1 / 3), 3e5, fixed=0.033, messages=100),
+    ("mumps", 3, 2): Cost((12.8, 2.0), (0.144, 4 / 3), (10_600, 1 / 3), 3e5, fixed=0.033, messages=100),
+    ("cg", 3, 1): Cost((0.8, 1.0), (0.022, 1.0), (900, 0.0), np.inf, iterations=(9, 9.6), messages=22),
+    ("cg", 3, 2): Cost((2.0, 1.0), (0.080, 1.0), (700, 0.0), np.inf, iterations=(16, 16), messages=22),
+    ("stars", 3, 2): Cost((2.8, 1.17), (0.044, 1.2), (3200, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
+    ("cg", 3, 3): Cost((2.0, 1.0), (0.06, 1.0), (1100, 0.0), np.inf, iterations=(16, 27), messages=22),
+    ("stars", 3, 3): Cost((15.0, 1.2), (0.15, 1.15), (6500, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
 }
 
 
@@ -156,8 +159,8 @@ class Work:
 
     def candidates(self) -> list[SolverName]:
         """Solvers of these elements that are measured at this size."""
-        kind = self._kind, self.order > 1
-        return [name for (name, *of), cost in COSTS.items() if tuple(of) == kind and self.n <= cost.most]
+        names = dict.fromkeys(name for name, d, least in COSTS if d == self._kind and least <= self.order)
+        return [name for name in names if self.n <= self._cost(name).most]
 
     def leanest(self) -> SolverName:
         """The candidate with the least modelled memory."""
@@ -198,7 +201,8 @@ class Work:
         return 2 if self.dimension < 3 else 3  # systems without a mesh count as those in 2D
 
     def _cost(self, name: SolverName) -> Cost:
-        return COSTS[name, self._kind, self.order > 1 or name == "stars"]
+        kinds = ((name, self._kind, least) for least in (min(self.order, 3), 2, 1))
+        return next(COSTS[kind] for kind in kinds if kind in COSTS)
 
     def _at(self, power: Power) -> float:
         value, exponent = power

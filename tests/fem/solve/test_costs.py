@@ -56,10 +56,10 @@ def test_more_steps_pay_for_a_dearer_factor() -> None:
 
 
 def test_every_kind_of_elements_has_a_solver_at_any_size() -> None:
-    for d, high in {(d, high) for _, d, high in COSTS}:
+    for d, order in {(d, order) for _, d, order in COSTS}:
         for few in (False, True):
             for n in (2, 10**8):
-                assert Work(n, d, 1 + high, 1, 10, few, SILICONE).candidates()
+                assert Work(n, d, order, 1, 10, few, SILICONE).candidates()
 
 
 def test_time_on_ranks() -> None:
