@@ -18,7 +18,8 @@ from softgrasp.fem.model.memory import factor_bytes, free_bytes, need, steps_of
 from softgrasp.fem.resources import size_text
 from softgrasp.fem.run.states.frames import frame_count
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.solve.costs import BUILD, ENTRIES, FEW_SOLVES, ITERATIVE, SolverName, seams
+from softgrasp.fem.solve.costs import BUILD, ENTRIES, ITERATIVE, SolverName, seams
+from softgrasp.fem.solve.stiffness import resting_solves
 
 if TYPE_CHECKING:
     from softgrasp.fem.run.contact.expected import ExpectedContact
@@ -75,7 +76,7 @@ def forecast(
     kind, work, share = (d, scene.tissue.order), steps_of(scene, n, d, ranks), seams(n, d, ranks)
     name, requested = work.solver(scene.time.solver, free), scene.time.solver
     first = scene.time.start == "equilibrium" and scene.effects.gravity
-    static = replace(work, solves=FEW_SOLVES, few=True)
+    static = replace(work, solves=resting_solves(n, d), few=True)
     resting = static.solver(requested, free)
     frames = frame_count(scene, n) + 1 if scene.output.fields != "none" else 0
     memory = need(scene, d, cells, ranks, free, run=True).of(1.0, ranks) + ranks * LIBRARIES

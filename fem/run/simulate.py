@@ -36,7 +36,7 @@ from softgrasp.fem.run.states.frames import boundaries, output_recorders
 from softgrasp.fem.run.states.trajectory import Trajectory
 from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.solve.statics import equilibrium
-from softgrasp.fem.solve.stiffness import static_solver
+from softgrasp.fem.solve.stiffness import resting_solves, static_solver
 
 if TYPE_CHECKING:
     from softgrasp.fem.run.contact.general import Contact
@@ -151,7 +151,8 @@ class Run(Stepped):
             return resting(self.contact, self.drive.q[0], time)
         if self.turning is not None:
             system = self.turning.as_it_hangs()
-        return equilibrium(system, static_solver(system, time.solver), time, self.settle)
+        solves = resting_solves(system.layout.n_e, system.layout.dimension)
+        return equilibrium(system, static_solver(system, time.solver, solves), time, self.settle)
 
     def take(self, ts: Any, step: int, check: bool = False) -> None:
         """Step up to a number, and see that the forces on the way were finite. Collective.

@@ -78,6 +78,11 @@ def shared_factor[S: Shared](system: BlockSystem, name: str, key: object, make: 
             made.destroy()
 
 
+def resting_solves(n: int, dimension: int) -> int:
+    """Static solves that an equilibrium is counted as: those of all that share its factor, where that is kept."""
+    return FEW_SOLVES if n <= KEPT_LIMIT[dimension] else 1
+
+
 def static_solver(system: BlockSystem, requested: str = "auto", solves: int = FEW_SOLVES) -> SolverName:
     """The solver of the least modelled time for static solves with K_ee, or K_ee + s D_ee + s^2 M_ee. Collective.
 

@@ -127,3 +127,6 @@ def test_static_solves_have_the_solver_of_the_least_modelled_time(monkeypatch: p
     assert names == ["stars", "mumps", "mumps"]
     assert stiffness.static_solver(replace(large, materials=(), kept={})) == "mumps"  # iterations are not known
     assert stiffness.static_solver(large, "cholesky") == "cholesky"
+    alone = replace(large, graded=False, kept={})
+    assert stiffness.static_solver(alone, solves=stiffness.resting_solves(200_000, 3)) == "stars"  # K's factor not kept
+    assert stiffness.resting_solves(100_000, 3) == stiffness.FEW_SOLVES
