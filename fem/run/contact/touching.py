@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from softgrasp.fem.petsc import Array, PETSc
+from softgrasp.fem.run.contact.landing import Landing, Landings
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 
 if TYPE_CHECKING:
@@ -20,16 +21,30 @@ class Touching(TissueMidpoint):
     SUBTREES: ClassVar[bool] = False
     contact: Contact | None = None
 
+    def _prepare(self) -> None:
+        super()._prepare()
+        self.landings = Landings()
+
     def solve_by(self, solve: Callable[[PETSc.Vec, PETSc.Vec], None]) -> None:
         """Let `solve_midpoint` do this with r and w in the place of a solve; who asks for it completes w."""
         self._solve = solve
 
     def advance(self, old: TissueState, new: TissueState) -> None:
         """Write the new state, carry k and r on, and stop what is pressed. Collective."""
+        contact = self.contact
+        if contact is None:
+            super().advance(old, new)
+            return
+        landing = Landing.of(self, old) if self.landings.has(contact.table, contact.n) and self.mends() else None
         super().advance(old, new)
-        if self.contact is not None:
-            self.contact.finish(new)
-            self.contact.table.add()
+        contact.finish(new)
+        if landing is not None:
+            landing.finish(self, new)
+        contact.table.add()
+
+    def mends(self) -> bool:
+        """Whether the momentum of a step can lose its residual: K, M and their multiples are all that S has."""
+        return self.system.points is None and self.operators.D is None
 
     def load_size(self) -> float:
         """See :meth:`TissueMidpoint.load_size`: with the forces of obstacles, which may balance. Collective."""
@@ -53,6 +68,8 @@ class Touching(TissueMidpoint):
         own, table, sets = np.split(numbers[3:], np.cumsum([count, shape[0] * shape[1]]))
         super().restore(rows, own)
         self.contact.restore(table.reshape(shape), sets)
+        for n in range(shape[0]):
+            self.landings.has(self.contact.table, n)
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
