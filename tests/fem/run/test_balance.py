@@ -34,7 +34,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_balance_closes_where_the_stiffness_loses_digits(name: str) -> None:
     scene, *changes = CASES[name]
-    assert simulate(build(scene, changes)).energy_drift < 1e-13  # of issue 28; measured 2e-15 to 7e-14
+    assert simulate(build(scene, changes)).energy_drift < 1e-13  # of issue 28; measured 4e-15 to 6e-14
 
 
 @pytest.mark.serial
@@ -103,4 +103,4 @@ def test_balance_closes_while_a_flat_face_lands(steps: int) -> None:
     run = simulate(scene)
     assert run.contact is not None
     assert run.contact.touching.max() > 500
-    assert run.energy_drift < 1e-13  # of issue 28; measured 1e-15 to 4e-14, 1.2e-13 to 2.7e-13 before
+    assert run.energy_drift < 1e-13  # of issue 28; measured 1e-15, 1.5e-13 to 2.7e-13 before
