@@ -19,6 +19,7 @@ from softgrasp.fem.run.energy import wide_product
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 
 RISE = 1 / 8  # nodes that land in a step over those that are pressed then, from which it counts as a landing [1]
+MANY = 100  # nodes that land then at the least: fewer leave below 5e-14, and products would double a step's time [1]
 AFTER = 16  # steps behind a landing in which its stiff modes still ring [1]
 ROUNDING = 1e-8  # a larger factor c is no rounding, and would hide an error [1]
 
@@ -34,7 +35,7 @@ class Landings:
         if n == 0:
             self.pressed, self.until = 0, -1
         pressed = sum(table.touching[n].tolist())
-        if pressed - self.pressed > RISE * pressed:
+        if pressed - self.pressed > max(RISE * pressed, MANY):
             self.until = n + AFTER
         self.pressed = pressed
         return n <= self.until
