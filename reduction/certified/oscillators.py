@@ -57,7 +57,7 @@ class SecondOrder:
     G: Array  # coupling to the hand at rho = 1 kg/m^3, (L, k, n_s)
     # of the last densities: these, the mass M = L L', L^-1, and both stiffnesses of every layer as L^-1 K L^-T
     kept: list[tuple[tuple[float, ...], Array, Array, Array, Array]] = field(
-        default_factory=list, repr=False, compare=False
+        default_factory=list, init=False, repr=False, compare=False
     )
 
     @staticmethod
@@ -87,11 +87,14 @@ class SecondOrder:
     def _in_mass(self, p: Parameters) -> tuple[Array, Array, Array, Array]:
         """M, L^-1 and the stiffnesses in columns orthonormal in M, made once for parameters of the same densities."""
         densities = tuple(m.dense for m in p.materials)
-        if not self.kept or self.kept[0][0] != densities:
+        kept = next(iter(self.kept), None)
+        if kept is None or kept[0] != densities:
             M = p.density(self.M)
             inverse = scipy.linalg.solve_triangular(np.linalg.cholesky(M), np.eye(len(M)), lower=True)
-            self.kept[:] = [(densities, M, inverse, *(inverse @ K @ inverse.T for K in (self.K_mu, self.K_lambda)))]
-        return self.kept[0][1:]
+            K_mu, K_lambda = (inverse @ K @ inverse.T for K in (self.K_mu, self.K_lambda))
+            kept = densities, M, inverse, K_mu, K_lambda
+            self.kept[:] = [kept]
+        return kept[1:]
 
 
 def march(omega: Array, rate: Array, loads: Array, dt: float, start: Array | None = None) -> Array:

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from softgrasp.fem.errors import Paused
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.symmetric import symmetric_part
 from softgrasp.fem.petsc import rows_on_all
+from softgrasp.fem.run.contact.landing import MANY
 from softgrasp.fem.run.energy import wide_product
 from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
-from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.velocity import restore_velocity
 from softgrasp.fem.solve.differences import minus_twice
 from tests.hardcases.contact import BODY, RUN, TABLE, vibrating
@@ -104,3 +106,17 @@ def test_balance_closes_while_a_flat_face_lands(steps: int) -> None:
     assert run.contact is not None
     assert run.contact.touching.max() > 500
     assert run.energy_drift < 1e-13  # of issue 28; measured 1e-15, 1.5e-13 to 2.7e-13 before
+
+
+@pytest.mark.serial
+def test_a_restart_behind_a_landing_repeats_the_bits(tmp_path: Path) -> None:
+    """The steps that the landing of 117 nodes changes are found again from the nodes that were pressed."""
+    changes = ["tissue.cells=[120, 2]", "time.steps=300", "time.end=0.45"]
+    whole = simulate(build("set_down", changes))
+    with pytest.raises(Paused):
+        simulate(build("set_down", changes), RunOptions(tmp_path, until=249))
+    again = simulate(build("set_down", changes), RunOptions(tmp_path, resume=True))
+    assert whole.contact is not None
+    assert np.diff(whole.contact.touching.sum(axis=1).astype(int))[:249].max() > MANY
+    assert np.array_equal(again.final, whole.final)
+    assert again.energy_drift == whole.energy_drift < 1e-13  # of issue 28

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model, build
@@ -15,6 +17,7 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.reduction.certified.dual import corrected
 from softgrasp.reduction.certified.model import CertifiedModel
+from softgrasp.reduction.certified.oscillators import SecondOrder
 from softgrasp.reduction.certified.training import certified_model
 from softgrasp.reduction.parameters import materials_at
 from tests.helpers.certified import EQUILIBRIUM, KELVIN_VOIGT, full_at
@@ -108,3 +111,23 @@ def test_a_file_keeps_the_duals(comm: MPI.Intracomm, mpi_tmp_path: Any) -> None:
     a, b = one.certificate.outputs.values, two.certificate.outputs.values
     assert np.array_equal(a, b)
     assert again.with_sizes(5, 10).duals is None
+
+
+@pytest.mark.serial
+def test_modes_are_those_of_the_matrices_at_hand() -> None:
+    """Kept factors belong to the object and its densities, not to what is replaced or came before [pairs of SciPy]."""
+    rng, one = np.random.default_rng(1), np.zeros((1, 4, 2))
+    X = rng.standard_normal((3, 1, 4, 4))
+    K_mu, K_lambda, M = X @ X.transpose(0, 1, 3, 2) + np.eye(4)
+    blocks = SecondOrder(K_mu, K_lambda, M, one)
+    for dense in (1.0, 2.0):
+        for each in (blocks, replace(blocks, K_mu=5 * K_mu), replace(blocks, M=3 * M), blocks):
+            p: Any = SimpleNamespace(
+                materials=[SimpleNamespace(dense=dense, beta=0.0)],
+                stiffness=lambda a, b: a[0] + 2 * b[0],
+                density=lambda a, dense=dense: dense * a[0],
+                damped=False,
+            )
+            modes, pencil = each.modes(p), (each.K_mu[0] + 2 * each.K_lambda[0], dense * each.M[0])
+            np.testing.assert_allclose(modes.omega**2, scipy.linalg.eigh(*pencil, eigvals_only=True), rtol=1e-10)
+            np.testing.assert_allclose(modes.X.T @ pencil[1] @ modes.X, np.eye(4), atol=1e-10)  # of condition 1e3
