@@ -9,16 +9,19 @@ momentum becomes that of v, and a factor gives back the energy that this and the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from softgrasp.fem.material import LayerMaterial, of_layers
 from softgrasp.fem.petsc import Array, rows_on_all
 from softgrasp.fem.run.contact.record import Tables
 from softgrasp.fem.run.energy import wide_product
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 
 RISE = 1 / 8  # nodes that land in a step over those that are pressed then, from which it counts as a landing [1]
+JUMP = 100  # stiffness of a layer over that of another, from which any number of nodes counts [1]
 MANY = 100  # nodes that land then at the least: fewer leave below 5e-14, and products would double a step's time [1]
 AFTER = 16  # steps behind a landing in which its stiff modes still ring [1]
 ROUNDING = 1e-8  # a larger factor c is no rounding, and would hide an error [1]
@@ -27,7 +30,9 @@ ROUNDING = 1e-8  # a larger factor c is no rounding, and would hide an error [1]
 class Landings:
     """Which steps of a run are landings, or close behind one."""
 
-    def __init__(self) -> None:
+    def __init__(self, materials: Sequence[LayerMaterial]) -> None:
+        mu = [m.mu for m in of_layers(materials)]
+        self.least = 0 if max(mu) > JUMP * min(mu) else MANY
         self.pressed, self.until = 0, -1
 
     def has(self, table: Tables, n: int) -> bool:
@@ -35,7 +40,7 @@ class Landings:
         if n == 0:
             self.pressed, self.until = 0, -1
         pressed = sum(table.touching[n].tolist())
-        if pressed - self.pressed > max(RISE * pressed, MANY):
+        if pressed - self.pressed > max(RISE * pressed, self.least):
             self.until = n + AFTER
         self.pressed = pressed
         return n <= self.until

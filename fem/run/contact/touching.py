@@ -23,7 +23,7 @@ class Touching(TissueMidpoint):
 
     def _prepare(self) -> None:
         super()._prepare()
-        self.landings = Landings()
+        self.landings = Landings(self.system.materials)
 
     def solve_by(self, solve: Callable[[PETSc.Vec, PETSc.Vec], None]) -> None:
         """Let `solve_midpoint` do this with r and w in the place of a solve; who asks for it completes w."""
