@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import re
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -171,6 +173,8 @@ def test_an_interrupted_run_goes_on(
         return text.getvalue()
 
     monkeypatch.setattr("softgrasp.study.control.run.RESTART_STATES", 0)
+    clock = SimpleNamespace(monotonic=itertools.count(1e9, 20).__next__)  # a machine on which files are never too near
+    monkeypatch.setattr("softgrasp.lqr.lowrank.newton.time", clock)
     monkeypatch.setattr("softgrasp.study.control.run.solver_bar", bar(30))
     with pytest.raises(_StopError):
         run()
