@@ -21,6 +21,7 @@ Integers = npt.NDArray[np.int64]
 Ints = npt.NDArray[np.int32]  # numbers and marks as DOLFINx has them
 Flags = npt.NDArray[np.bool_]
 
+MOST_PAIRS = 500_000  # of balls and points that are compared one by one [1]: 12 MB; the tree is quick but slow to import
 FLAT = 1e-12  # volume over (longest edge)^d: far above round-off (1e-16), far below any usable cell
 
 
@@ -139,6 +140,18 @@ def sort_facets(cells: Integers) -> Facets:
     return Facets(nodes, order % n, (nodes[1:] == nodes[:-1]).all(axis=1))
 
 
+def _within(points: Floats, middles: Floats, radii: Floats) -> tuple[Integers, Integers]:
+    """Numbers of a ball and of a point in it, for all pairs of both."""
+    if len(points) * len(middles) <= MOST_PAIRS:
+        squares = ((middles[:, None] - points) ** 2).sum(axis=2)
+        ball, point = np.nonzero(squares <= radii[:, None] ** 2)
+        return ball, point
+    from scipy.spatial import cKDTree  # slow to import
+
+    lists = cKDTree(points).query_ball_point(middles, radii)
+    return np.repeat(np.arange(len(lists)), [len(entry) for entry in lists]), np.concatenate([*lists, []]).astype(int)
+
+
 def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: float) -> Integers:
     """Representative of each node: itself, or the first of the boundary nodes at its place.
 
@@ -146,8 +159,6 @@ def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
 
     ``tolerance``: share of h, < 1/2 [1].
     """
-    from scipy.spatial import cKDTree  # slow to import, and for mesh files alone
-
     owners = cells[np.unique(facets.cells[facets.outer])]
     h = np.full(len(points), np.inf)
     for i, j in combinations(range(cells.shape[1]), 2):
@@ -155,12 +166,8 @@ def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
         np.minimum.at(h, owners[:, i], length)
         np.minimum.at(h, owners[:, j], length)
     nodes = np.unique(facets.nodes[facets.outer])
-    tree = cKDTree(points[nodes])
-    radius = tolerance * h[nodes]
-    near = np.flatnonzero(tree.query_ball_point(points[nodes], radius, return_length=True) > 1)
-    lists = tree.query_ball_point(points[nodes[near]], radius[near])
-    one = nodes[np.repeat(near, [len(entry) for entry in lists])]
-    other = nodes[np.concatenate([*lists, []]).astype(np.int64)]
+    at, near = _within(points[nodes], points[nodes], tolerance * h[nodes])
+    one, other = nodes[at], nodes[near]
     close = np.linalg.norm(points[one] - points[other], axis=1) <= tolerance * h[other]
     _, labels = linked(one[close], other[close], len(points))
     _, first = np.unique(labels, return_index=True)
@@ -172,15 +179,12 @@ def hanging_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
 
     ``tolerance``: largest distance from the facet over its longest edge, and least from its corners [1].
     """
-    from scipy.spatial import cKDTree  # slow to import, and for mesh files alone
-
     faces, owners = facets.nodes[facets.outer], cells[facets.cells[facets.outer]]
     nodes = np.unique(faces)
     middles = points[faces].mean(axis=1)
     radii = np.linalg.norm(points[faces] - middles[:, None], axis=2).max(axis=1)
-    lists = cKDTree(points[nodes]).query_ball_point(middles, radii)  # its corners lie on that ball, and count not
-    face = np.repeat(np.arange(len(faces)), [len(entry) for entry in lists])
-    node = nodes[np.concatenate([*lists, []]).astype(np.int64)]
+    face, near = _within(points[nodes], middles, radii)  # its corners lie on that ball, and count not
+    node = nodes[near]
     foreign = (node[:, None] != owners[face]).all(axis=1)
     face, node = face[foreign], node[foreign]
     start = points[faces[face, 0]]

@@ -164,8 +164,12 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
 def _find(ridges: Integers, rows: Integers) -> Integers:
     """Numbers of the ridges that sorted rows are, (rows,)."""
     n = int(ridges.max(initial=0)) + 1
-    code = np.array([n**k for k in reversed(range(ridges.shape[1]))], dtype=np.int64)
-    return np.searchsorted(ridges @ code, rows @ code)
+    return np.searchsorted(_codes(ridges, n), _codes(rows, n))
+
+
+def _codes(rows: Integers, n: int) -> Integers:
+    """A number for each row of numbers below n, in the order of rows."""
+    return np.asarray(rows @ np.array([n**k for k in reversed(range(rows.shape[1]))], dtype=np.int64))
 
 
 def _angles(points: Floats, cells: Integers) -> tuple[Integers, Floats]:
@@ -182,8 +186,10 @@ def _angles(points: Floats, cells: Integers) -> tuple[Integers, Floats]:
         cosine = np.einsum("ij,ij->i", a, b) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
         rows.append(np.sort(cells[:, list(corner)], axis=1))
         values.append(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    ridges, inverse = np.unique(np.concatenate(rows), axis=0, return_inverse=True)
-    return ridges, np.bincount(inverse.ravel(), weights=np.concatenate(values), minlength=len(ridges))
+    every = np.concatenate(rows)
+    _, first, inverse = np.unique(_codes(every, len(points)), return_index=True, return_inverse=True)
+    ridges = every[first]
+    return ridges, np.bincount(inverse, weights=np.concatenate(values), minlength=len(ridges))
 
 
 def _per_ridge(facets: Integers, ridges: Integers, d: int) -> Integers:

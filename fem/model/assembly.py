@@ -27,7 +27,7 @@ from softgrasp.fem.model.contact import (
     rigid_modes,
 )
 from softgrasp.fem.model.patches import make_patches
-from softgrasp.fem.model.symmetric import symmetric_part
+from softgrasp.fem.model.symmetric import Mirror
 from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.scene.scene import FiniteStrain, Scene
 from softgrasp.fem.system import Component, LayerBlocks
@@ -171,6 +171,7 @@ class Blocks:
         self.layered = bool(scene.tissue.layers)
         self.cells = [np.flatnonzero(space.layer == i).astype(np.int32) for i in range(len(space.layers))]
         self.csr: Any = None
+        self.mirror: Mirror | None = None  # of the pattern of csr
         if len(self.cells) > 1:
             # DOLFINx gives a layer the pattern of its own cells, and sums of layers need one pattern for all
             owned = np.arange(space.mesh.owned, dtype=np.int32)
@@ -188,7 +189,32 @@ class Blocks:
         """The blocks of a bilinear form, of its symmetric part if it is known to be symmetric. Collective."""
         compiled = dolfinx.fem.form(form)
         self.csr = self.csr or dolfinx.fem.create_matrix(compiled)
-        return _component(self.space, _assembled(self.domain.comm, self.csr, compiled, symmetric), self.thickness)
+        return _component(self.space, self._assembled(compiled, symmetric), self.thickness)
+
+    def _assembled(self, form: Any, symmetric: bool) -> PETSc.Mat:
+        """The form's matrix as PETSc AIJ, with the same bits in every run on the same number of ranks. Collective.
+
+        PETSc adds what other ranks give to a row in the order their messages arrive; DOLFINx's own matrix adds it in
+        the order of the ranks.
+        """
+        csr, comm = self.csr, self.domain.comm
+        csr.set_value(0.0)
+        dolfinx.fem.assemble_matrix(csr, form)
+        csr.scatter_reverse()
+        rows, columns, d = csr.index_map(0), csr.index_map(1), csr.block_size[0]
+        n = rows.size_local
+        used = csr.indptr[n]
+        numbers = columns.local_to_global(csr.indices[:used].astype(np.int32))
+        blocks = csr.data[: used * d * d].reshape(-1, d, d)
+        if symmetric:
+            self.mirror = self.mirror or Mirror(comm, rows.local_range[0], csr.indptr[: n + 1], numbers)
+            blocks = self.mirror.symmetric_part(blocks)
+        shape = n * d, columns.size_global * d
+        A = scipy.sparse.bsr_matrix((blocks, numbers, csr.indptr[: n + 1]), shape=shape).tocsr()
+        A.sort_indices()
+        size = ((n * d, rows.size_global * d), (columns.size_local * d, columns.size_global * d))
+        entries = (A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data)
+        return PETSc.Mat().createAIJ(size, bsize=d, csr=entries, comm=comm)
 
 
 def assemble(
@@ -212,29 +238,6 @@ def assemble(
         M_1 = parts["M_1"]
         result.append(LayerBlocks(name, parts.get("K_mu", M_1), parts.get("K_lambda", M_1), M_1))
     return tuple(result)
-
-
-def _assembled(comm: MPI.Intracomm, csr: Any, form: Any, symmetric: bool) -> PETSc.Mat:
-    """The form's matrix as PETSc AIJ, with the same bits in every run on the same number of ranks. Collective.
-
-    PETSc adds what other ranks give to a row in the order their messages arrive; DOLFINx's own matrix adds it in the
-    order of the ranks.
-    """
-    csr.set_value(0.0)
-    dolfinx.fem.assemble_matrix(csr, form)
-    csr.scatter_reverse()
-    rows, columns, d = csr.index_map(0), csr.index_map(1), csr.block_size[0]
-    n = rows.size_local
-    used = csr.indptr[n]
-    numbers = columns.local_to_global(csr.indices[:used].astype(np.int32))
-    blocks = csr.data[: used * d * d].reshape(-1, d, d)
-    if symmetric:
-        blocks = symmetric_part(comm, rows.local_range[0], csr.indptr[: n + 1], numbers, blocks)
-    A = scipy.sparse.bsr_matrix((blocks, numbers, csr.indptr[: n + 1]), shape=(n * d, columns.size_global * d)).tocsr()
-    A.sort_indices()
-    size = ((n * d, rows.size_global * d), (columns.size_local * d, columns.size_global * d))
-    entries = (A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data)
-    return PETSc.Mat().createAIJ(size, bsize=d, csr=entries, comm=comm)
 
 
 def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[LayerMaterial, ...]:

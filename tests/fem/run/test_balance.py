@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import Paused
 from softgrasp.fem.model.build import build
-from softgrasp.fem.model.symmetric import symmetric_part
+from softgrasp.fem.model.symmetric import Mirror
 from softgrasp.fem.petsc import rows_on_all
 from softgrasp.fem.run.contact.landing import MANY
 from softgrasp.fem.run.energy import wide_product
@@ -74,7 +74,8 @@ def test_symmetric_part_where_other_ranks_have_no_rows(comm: MPI.Intracomm) -> N
     here, n, d = comm.rank == comm.size - 1, 3, 2
     A = np.random.default_rng(5).standard_normal((n, n, d, d))
     rows = n if here else 0
-    found = symmetric_part(comm, 0, n * np.arange(rows + 1), np.tile(np.arange(n), rows), A[:rows].reshape(-1, d, d))
+    mirror = Mirror(comm, 0, n * np.arange(rows + 1), np.tile(np.arange(n), rows))
+    found = mirror.symmetric_part(A[:rows].reshape(-1, d, d))
     assert np.array_equal(found, ((A + A.transpose(1, 0, 3, 2)) / 2)[:rows].reshape(-1, d, d))
 
 
