@@ -81,21 +81,28 @@ def check_cells(points: Floats, cells: Integers, repair: bool, name: str) -> Int
     return turned
 
 
-def linked(one: Integers, other: Integers, n: int) -> tuple[int, Ints]:
-    """Number of the connected components of n items with these links, and the component of each item."""
-    from scipy.sparse import coo_array, csgraph  # slow to import, and for mesh files alone
+def linked(one: Integers, other: Integers, n: int) -> Integers:
+    """The smallest item that each of n items is connected with by these links, itself perhaps.
 
-    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
-    count, labels = csgraph.connected_components(graph.tocsr(), directed=False)
-    return count, labels
+    Each link passes the smaller number on, and each item takes over that of the item whose number it has.
+    """
+    label = np.arange(n)
+    while True:
+        low = np.minimum(label[one], label[other])
+        lower = label.copy()
+        np.minimum.at(lower, label[one], low)
+        np.minimum.at(lower, label[other], low)
+        lower = lower[lower]
+        if np.array_equal(lower, label):
+            return label
+        label = lower
 
 
 def components(cells: Integers, n_points: int) -> tuple[int, Ints]:
     """Count the parts of a mesh that share no node, and label each cell with its part (from 0)."""
     rows = np.repeat(cells[:, 0], cells.shape[1] - 1)
     columns = cells[:, 1:].ravel()
-    _, labels = linked(rows, columns, n_points)
-    used, parts = np.unique(labels[cells[:, 0]], return_inverse=True)
+    used, parts = np.unique(linked(rows, columns, n_points)[cells[:, 0]], return_inverse=True)
     return len(used), parts.astype(np.int32)
 
 
@@ -169,9 +176,7 @@ def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
     at, near = _within(points[nodes], points[nodes], tolerance * h[nodes])
     one, other = nodes[at], nodes[near]
     close = np.linalg.norm(points[one] - points[other], axis=1) <= tolerance * h[other]
-    _, labels = linked(one[close], other[close], len(points))
-    _, first = np.unique(labels, return_index=True)
-    return np.asarray(first[labels], dtype=np.int64)
+    return linked(one[close], other[close], len(points))
 
 
 def hanging_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: float) -> Integers:
@@ -259,7 +264,8 @@ def find_parts(points: Floats, cells: Integers, facets: Facets, name: str) -> tu
         raise MeshError(
             f"{name} has facets with more than two cells, the first around {place_text(place)}: remove doubled cells."
         )
-    count, labels = linked(*facets.pairs, len(cells))
+    used, labels = np.unique(linked(*facets.pairs, len(cells)), return_inverse=True)
+    count = len(used)
     if count == 1:
         return None
     total = np.bincount(labels, minlength=count)
