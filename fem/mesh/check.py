@@ -21,7 +21,7 @@ Integers = npt.NDArray[np.int64]
 Ints = npt.NDArray[np.int32]  # numbers and marks as DOLFINx has them
 Flags = npt.NDArray[np.bool_]
 
-MOST_PAIRS = 500_000  # of balls and points that are compared one by one [1]: 12 MB; the tree is quick but slow to import
+MOST_PAIRS = 500_000  # of balls and points that are compared one by one [1], 12 MB: the tree is slow to import
 FLAT = 1e-12  # volume over (longest edge)^d: far above round-off (1e-16), far below any usable cell
 
 

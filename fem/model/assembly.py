@@ -12,7 +12,6 @@ import dolfinx.fem
 import numpy as np
 import scipy.sparse
 import ufl
-from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import BlockLayout, bounding_box

@@ -9,7 +9,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from softgrasp.fem import Scene, note, resolved_toml
@@ -94,6 +93,8 @@ def write_report(
 
     Raises ValueError: a row is not as long as its table's header or first row, or the page would load anything.
     """
+    from jinja2 import Environment, StrictUndefined  # not every command writes a page
+
     given = list(page.sections)
     if scene and all(section.title != EQUATION for section in given):
         given.insert(1, of_scene(scene))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from softgrasp.fem.errors import MeshError
+from softgrasp.fem.mesh import check
 from softgrasp.fem.mesh.check import doubled_nodes, place_text, sort_facets
 from softgrasp.fem.mesh.file import read_mesh
 from softgrasp.fem.model.contact import cells_in, contact_facets, held_check
@@ -86,13 +87,27 @@ def test_a_conforming_mesh_warns_of_nothing(mpi_tmp_path: Path, dimension: int) 
 
 
 @pytest.mark.serial
-def test_many_copies_of_a_node_are_one_place() -> None:
-    """Triangles that share nothing: every corner has as many copies as cells meet there."""
+@pytest.mark.parametrize("pairs", [check.MOST_PAIRS, 0])
+def test_many_copies_of_a_node_are_one_place(pairs: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Triangles that share nothing: every corner has as many copies as cells meet there, as pairs or a tree find."""
+    monkeypatch.setattr(check, "MOST_PAIRS", pairs)
     points, cells, _ = grid(2, 3)
     apart = np.arange(cells.size).reshape(cells.shape)
     first = doubled_nodes(points[cells.ravel()], apart, sort_facets(apart), 1e-4)
     assert len(np.unique(first)) == len(points)
     assert np.array_equal(points[cells.ravel()], points[cells.ravel()][first])
+
+
+@pytest.mark.serial
+def test_linked_items_have_the_smallest_number_of_their_part() -> None:
+    """Against SciPy's graphs: a path in random order, which the numbers pass along, and links at random."""
+    n, random = 2000, np.random.default_rng(7)
+    path = random.permutation(n)
+    for one, other in ((path[:-1], path[1:]), random.integers(0, n, (2, n // 2))):
+        graph = coo_array((np.ones(len(one)), (one, other)), shape=(n, n))
+        _, parts = csgraph.connected_components(graph, directed=False)
+        _, first = np.unique(parts, return_index=True)
+        assert np.array_equal(check.linked(one, other, n), first[parts])
 
 
 @pytest.mark.parametrize("tags", [(2**32 + 3, 3), (2**63 + 1, 2**63 + 2), (-(2**40), 2**40)])
