@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import meshio
 import numpy as np
 import pytest
+from scipy.sparse import coo_array, csgraph
 
 from softgrasp.fem.errors import MeshError
 from softgrasp.fem.mesh import check
