@@ -86,7 +86,8 @@ def resting_solves(n: int, dimension: int) -> int:
 def static_solver(system: BlockSystem, requested: str = "auto", solves: int = FEW_SOLVES) -> SolverName:
     """The solver of the least modelled time for static solves with K_ee, or K_ee + s D_ee + s^2 M_ee. Collective.
 
-    A system has one for each number of solves, however much memory is left later, so that its factor is shared.
+    A system has one for each number of solves, however much memory is left later, so that its factor is shared. With
+    ``output.memory`` in the scene no machine's free memory counts.
     """
     if requested != "auto":
         return cast(SolverName, requested)
@@ -95,7 +96,7 @@ def static_solver(system: BlockSystem, requested: str = "auto", solves: int = FE
         # tangents of finite strain may lose definiteness, which a factor reports
         known = bool(system.materials) and system.points is None
         work = work_of(system.layout, solves, True, system.contrast if known else UNKNOWN)
-        free = system.layout.comm.allreduce(free_memory(), MPI.MIN)
+        free = system.layout.comm.allreduce(system.memory or free_memory(), MPI.MIN)
         chosen[solves] = replace(work, graded=system.graded).solver(memory=free)
     return cast(SolverName, chosen[solves])
 

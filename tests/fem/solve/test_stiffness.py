@@ -123,10 +123,12 @@ def test_static_solves_have_the_solver_of_the_least_modelled_time(monkeypatch: p
         monkeypatch.setattr(stiffness, "free_memory", lambda: 1e9)
         assert stiffness.static_solver(large) == names[-1]
         assert stiffness.static_solver(replace(large, kept={})) == "stars"  # a factor takes 2.7 GB
+        assert stiffness.static_solver(replace(large, memory=1e10, kept={})) == names[-1]  # not what is free
         monkeypatch.undo()
     assert names == ["stars", "mumps", "mumps"]
     assert stiffness.static_solver(replace(large, materials=(), kept={})) == "mumps"  # iterations are not known
     assert stiffness.static_solver(large, "cholesky") == "cholesky"
+    assert build(make_scene(CUBE, {"output": {"memory": 2.0}}), comm=MPI.COMM_SELF).system.memory == 2 * 2.0**30
     alone = replace(large, graded=False, kept={})
     assert stiffness.static_solver(alone, solves=stiffness.resting_solves(200_000, 3)) == "stars"  # K's factor not kept
     assert stiffness.resting_solves(100_000, 3) == stiffness.FEW_SOLVES
