@@ -1,11 +1,11 @@
-"""The product -2 K z of a step by differences of neighbours, which keeps digits that the entries of K would lose.
+"""Products by differences of neighbours, which keep digits that the entries of a stiff matrix would lose.
 
     (K z)_i = sum over j of K_ij (z_j - z_i) + R_i z_i,   R_i = sum over j of K_ij,
 
 for blocks K_ij of d x d of the nodes. Entries of K grow with the ratio of the sides of a cell and with lambda, while a
 smooth z leaves little of them in K z; the rounding of that sum is a force in every step. R_i is not zero beside the
 nodes that the hand holds alone, but for rounding. As K = K', a pair of nodes is read once for both of its products:
-half the memory of K.
+half the memory of K. A step multiplies with -2 K, and CG over vertex stars with its matrix S.
 """
 
 from __future__ import annotations
@@ -66,26 +66,27 @@ class Blocks:
 
 
 class Differences:
-    """-2 K z with the calls of a PETSc matrix. Making one is collective, and so are the products.
+    """Products factor K z with the calls of a PETSc matrix. Making one is collective, and so are the products.
 
     Args:
-        rows: blocks of K on the rows here, columns among all nodes.
+        rows: blocks of K = K' on the rows here, columns among all nodes.
         begin: number of the first node here.
         like: a vector of the rows here, kept.
         code: from `product_code`.
+        factor: of the product [1].
     """
 
-    def __init__(self, rows: Blocks, begin: int, like: PETSc.Vec, code: Any) -> None:
+    def __init__(self, rows: Blocks, begin: int, like: PETSc.Vec, code: Any, factor: float) -> None:
         d, nodes = rows.values.shape[1], len(rows.first) - 1
         here = np.repeat(np.arange(begin, begin + nodes, dtype=np.intc), np.diff(rows.first))
         sums, self.like = np.empty((nodes, d, d)), like
         code.softgrasp_sums(d, nodes, *map(address, (rows.first, rows.values, sums)))
         mine = (rows.columns >= begin) & (rows.columns < begin + nodes)
-        self.diagonal: Array = -2 * rows.values[rows.columns == here].diagonal(axis1=1, axis2=2).ravel()
+        self.diagonal: Array = factor * rows.values[rows.columns == here].diagonal(axis1=1, axis2=2).ravel()
         above, beside = rows.where(mine & (rows.columns > here)), rows.where(~mine)
-        above.values.__imul__(-2.0)
-        beside.values.__imul__(-2.0)
-        sums *= -2.0
+        above.values.__imul__(factor)
+        beside.values.__imul__(factor)
+        sums *= factor
         above.columns.__isub__(np.intc(begin))
         self._pairs = code.softgrasp_pairs
         self._arguments = (d, nodes, *map(address, (above.first, above.columns, above.values, sums)))
@@ -116,18 +117,18 @@ class Differences:
         return self.like.duplicate()
 
     def getDiagonal(self) -> PETSc.Vec:  # noqa: N802 - of PETSc
-        """The diagonal of -2 K."""
+        """The diagonal of factor K."""
         result = self.like.duplicate()
         result.array_w[:] = self.diagonal
         return result
 
     def mult(self, z: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Set y = -2 K z. Collective."""
+        """Set y = factor K z. Collective."""
         y.set(0.0)
         self.multAdd(z, y, y)
 
     def multAdd(self, z: PETSc.Vec, r: PETSc.Vec, y: PETSc.Vec) -> None:  # noqa: N802 - of PETSc
-        """Set y = r - 2 K z. Collective."""
+        """Set y = r + factor K z. Collective."""
         if y is not r:
             r.copy(y)
         if z is not self._z:
@@ -139,6 +140,11 @@ class Differences:
             self._beside(*self._of_ghosts, self._from, self._to)
         self._pairs(*self._arguments, self._from, self._to)
         y.stateIncrease()
+
+    @property
+    def arrays(self) -> list[Any]:
+        """Numbers of the matrix here, and the columns of its blocks."""
+        return [self.sums, *(part for rows in (self.above, self.beside) for part in (rows.values, rows.columns))]
 
     def destroy(self) -> None:
         """Free PETSc's objects. Collective."""
@@ -157,6 +163,11 @@ def minus_twice(A: PETSc.Mat, d: int, dissection: Dissection | None = None) -> D
             K.convert("baij")
         K.scale(-2.0)
         return K
+    return differences(A, d, code, -2.0, dissection)
+
+
+def differences(A: PETSc.Mat, d: int, code: Any, factor: float, dissection: Dissection | None = None) -> Differences:
+    """Products with factor A, A = A', in the order of its rows or of a dissection. Collective."""
     if dissection is None:
         rows = to_scipy(A).tobsr((d, d))
         blocks = rows.indptr, rows.indices, rows.data
@@ -164,4 +175,27 @@ def minus_twice(A: PETSc.Mat, d: int, dissection: Dissection | None = None) -> D
         blocks = dissection.blocks(A)
     first, columns, values = blocks
     rows_here = Blocks(first.astype(np.intc), columns.astype(np.intc), np.ascontiguousarray(values))
-    return Differences(rows_here, A.getOwnershipRange()[0] // d, A.createVecLeft(), code)
+    return Differences(rows_here, A.getOwnershipRange()[0] // d, A.createVecLeft(), code, factor)
+
+
+class Multiplied:
+    """What PETSc calls for the product with a matrix that is not assembled."""
+
+    def __init__(self, product: Any) -> None:
+        self.product = product
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Set y = A x. Collective."""
+        self.product.mult(x, y)
+
+
+def arrays_of(A: PETSc.Mat) -> list[Any]:
+    """Numbers and indices of a matrix on this rank."""
+    return list(A.getPythonContext().product.arrays if A.getType() == "python" else A.getValuesCSR())
+
+
+def as_matrix(product: Any, A: PETSc.Mat) -> PETSc.Mat:
+    """A product with vectors as a PETSc matrix, symmetric and positive definite, of the sizes of A. Collective."""
+    result = PETSc.Mat().createPython(A.getSizes(), Multiplied(product), comm=A.comm)
+    result.setOption(PETSc.Mat.Option.SPD, True)
+    return result

@@ -1,6 +1,10 @@
 /* Products with K whose terms cancel: by the differences of neighbours, and in long double. Blocks of d x d, row by
-   row; see fem/solve/differences.py and fem/run/energy.py. */
+   row; see fem/solve/differences.py and fem/run/energy.py. The product of fem/solve/smoother.py. */
 #include <stddef.h>
+
+typedef float four_singles __attribute__((vector_size(16), aligned(4)));
+typedef double four __attribute__((vector_size(32)));
+#define WIDE(w) __builtin_convertvector(w, four)
 
 #define INLINE static inline __attribute__((always_inline)) /* so that d is a constant in all loops */
 
@@ -38,6 +42,43 @@ INLINE void beside_as(const int d, int nodes, const int *first, const int *col, 
 
 #define OF_BOTH(name, ...) (d == 2 ? name(2, __VA_ARGS__) : name(3, __VA_ARGS__))
 
+/* y += sum over the stars of R'W'W R x, W lower triangular in rows, four stars of one size beside each other. Nodes from
+   `own` on are of other ranks: their x is in `ghost`, their part of y is added to `back`. */
+INLINE void stars_as(const int d, int groups, const int *sizes, const int *node, const float *W, int own,
+                     const double *restrict x, const double *restrict ghost, double *restrict y,
+                     double *restrict back) {
+  const four_singles *row = (const four_singles *)W;
+  for (int g = 0; g < groups; g++) {
+    const int m = sizes[g], n = d * m;
+    four X[n], Y[n];
+    for (int k = 0; k < 4 * m; k++) {
+      const double *from = node[k] < own ? x + (size_t)node[k] * d : ghost + (size_t)(node[k] - own) * d;
+      for (int a = 0; a < d; a++) X[k / 4 * d + a][k % 4] = from[a];
+    }
+    for (int i = 0; i < n; i++) Y[i] = (four){0};
+    for (int i = 0; i < n; i += d) { /* the rows of a node: u = W x, y += W'u */
+      const four_singles *w[3];
+      four u[3];
+      for (int a = 0; a < d; row += i + ++a) {
+        w[a] = row;
+        u[a] = (four){0};
+        for (int j = i; j <= i + a; j++) u[a] += WIDE(row[j]) * X[j];
+      }
+      for (int j = 0; j < i; j++)
+        for (int a = 0; a < d; a++) u[a] += WIDE(w[a][j]) * X[j];
+      for (int j = 0; j < i; j++)
+        for (int a = 0; a < d; a++) Y[j] += WIDE(w[a][j]) * u[a];
+      for (int a = 0; a < d; a++)
+        for (int j = i; j <= i + a; j++) Y[j] += WIDE(w[a][j]) * u[a];
+    }
+    for (int k = 0; k < 4 * m; k++) {
+      double *to = node[k] < own ? y + (size_t)node[k] * d : back + (size_t)(node[k] - own) * d;
+      for (int a = 0; a < d; a++) to[a] += Y[k / 4 * d + a][k % 4];
+    }
+    node += 4 * m;
+  }
+}
+
 void softgrasp_pairs(int d, int nodes, const int *first, const int *col, const double *K, const double *R,
                      const double *z, double *y) {
   OF_BOTH(pairs_as, nodes, first, col, K, R, z, y);
@@ -46,6 +87,11 @@ void softgrasp_pairs(int d, int nodes, const int *first, const int *col, const d
 void softgrasp_beside(int d, int nodes, const int *first, const int *col, const double *K, const double *ghost,
                       const double *z, double *y) {
   OF_BOTH(beside_as, nodes, first, col, K, ghost, z, y);
+}
+
+void softgrasp_stars(int d, int groups, const int *sizes, const int *node, const float *W, int own, const double *x,
+                     const double *ghost, double *y, double *back) {
+  OF_BOTH(stars_as, groups, sizes, node, W, own, x, ghost, y, back);
 }
 
 /* Sums R (nodes, d, d) of the blocks of each row. */

@@ -214,7 +214,10 @@ class TissueSolver:
         ``S`` itself keeps its numbers where blocks are factored, and :meth:`check` is of no use afterwards.
         """
         if self.stars is not None:
-            self.stars.renew(A)
+            try:
+                self.stars.renew(A)
+            except np.linalg.LinAlgError:
+                return False
             return True
         P = self.ksp.getOperators()[0]
         if "sbaij" in P.getType():

@@ -4,26 +4,24 @@ A V-cycle smooths S w = r by Chebyshev iterations with the overlapping blocks of
 
     B = sum over vertices of R_v' (R_v S R_v')^-1 R_v,
 
-R_v taking the free nodes of the cells at v, and corrects it on linear elements, P'S P e = P'r. B is one sparse matrix:
-for quadratic elements it has fewer entries than S.
+R_v taking the free nodes of the cells at v, in single precision (`softgrasp.fem.solve.smoother`), and corrects it on
+linear elements, P'S P e = P'r.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import scipy.sparse
-from mpi4py import MPI
 from numpy.typing import NDArray
 
-from softgrasp.fem.layout import BlockLayout, Patches
-from softgrasp.fem.petsc import Array, PETSc, petsc_options, to_ranks
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array, PETSc, petsc_options, user_options
+from softgrasp.fem.solve.differences import Differences, as_matrix, differences, product_code, require_same_code
+from softgrasp.fem.solve.smoother import Smoother
 
 DEGREE = 2  # degree of the Chebyshev polynomial: 3 saves a sixth of the iterations for 1.4 times the time
 COARSE_LIMIT = 20_000  # largest number of unknowns of the linear elements that one rank factors [1]
-BYTES = 2**26  # memory of the stars that are inverted at once [byte]
 # The upper bound of the spectrum of B S is PETSc's estimate; what lies below a tenth of it is left to the coarse level.
 SMOOTHER: dict[str, object] = {"mg_levels_ksp_chebyshev_esteig": "0,0.1,0,1.1", "mg_levels_ksp_type": "chebyshev"}
 FACTORED: dict[str, object] = {
@@ -63,25 +61,33 @@ class Stars:
         d, p = layout.dimension, self.patches
         q = np.arange(d)
         rows, columns = d * p.row[:, None] + q, d * p.column[:, None] + q
-        ranges = np.asarray(S.getOwnershipRanges(), dtype=np.int64) // d
-        self.blocks = pattern(p, layout.comm, ranges)
+        require_same_code(layout.comm)
         self.P = self._matrix(d * p.count, rows, columns, np.repeat(p.weight, d))
         self.factored = factored(layout)
         self.matrices: tuple[PETSc.Mat, ...] = ()
+        self.products: tuple[Smoother | Differences, ...] = ()
         self.renew(S)
 
     def renew(self, S: PETSc.Mat) -> None:
-        """Set up the V-cycle for another matrix of the same pattern. Collective."""
+        """Set up the V-cycle for another matrix of the same pattern. Collective.
+
+        Raises LinAlgError: S is not positive definite; what was set up before remains.
+        """
         d, ksp = self.layout.dimension, self.ksp
-        for old in self.matrices:
-            old.destroy()
-        smoother = self._smoother(S)
+        blocks = Smoother(S, self.patches, d)
+        self._free()
         linear = S.ptap(self.P)
         linear.setBlockSize(d)
         self._set_rigid_modes(linear)
-        fine = S.convert("baij", PETSc.Mat())
-        for A in (fine, linear):
-            A.setOption(PETSc.Mat.Option.SPD, True)
+        linear.setOption(PETSc.Mat.Option.SPD, True)
+        code, smoother = product_code(), as_matrix(blocks, S)
+        self.products = (blocks,)
+        if code is None or user_options(ksp.getOptionsPrefix()):  # which may ask for entries
+            fine = S.convert("baij", PETSc.Mat())
+            fine.setOption(PETSc.Mat.Option.SPD, True)
+        else:
+            pairs = differences(S, d, code, 1.0)
+            self.products, fine = (blocks, pairs), as_matrix(pairs, S)
         self.matrices = fine, smoother, linear
         ksp.setOperators(fine)
         pc = ksp.getPC()
@@ -112,19 +118,6 @@ class Stars:
         pc = pc.getMGCoarseSolve().getPC()
         return str(pc.getFactorSolverType() or pc.getType()).upper()
 
-    def _smoother(self, S: PETSc.Mat) -> PETSc.Mat:
-        """B in blocks. Collective."""
-        d, size = self.layout.dimension, (self.layout.n_local, self.layout.n_e)
-        B = PETSc.Mat().createBAIJ((size, size), d, nnz=self.blocks, comm=self.layout.comm)
-        for nodes, inverses in star_inverses(S, self.patches, d):
-            stars, m = nodes.shape
-            rows, columns = nodes.ravel().astype(PETSc.IntType), np.repeat(nodes, m, axis=0).ravel()
-            starts = m * np.arange(stars * m + 1, dtype=PETSc.IntType)
-            blocks = inverses.reshape(stars, m, d, m, d).transpose(0, 1, 3, 2, 4).ravel()
-            B.setValuesBlockedIJV(starts, columns.astype(PETSc.IntType), blocks, addv=True, rowmap=rows)
-        B.assemble()
-        return B
-
     def _matrix(self, columns: int, rows: NDArray[Any], at: NDArray[Any], values: Array) -> PETSc.Mat:
         """A matrix of n_local rows from entries of any rank, which are added."""
         A, d = PETSc.Mat().create(self.layout.comm), self.layout.dimension
@@ -146,62 +139,15 @@ class Stars:
 
     def destroy(self) -> None:
         """Free all matrices; the solver is its owner's. Collective."""
-        for A in (*self.matrices, self.P):
-            A.destroy()
+        self._free()
+        self.P.destroy()
+
+    def _free(self) -> None:
+        for part in (*self.matrices, *self.products):
+            part.destroy()
 
 
 def factored(layout: BlockLayout) -> bool:
     """Whether the linear elements of a layout with patches are factored."""
     assert layout.patches is not None
     return layout.comm.size == 1 and layout.patches().count * layout.dimension <= COARSE_LIMIT
-
-
-def star_inverses(S: PETSc.Mat, patches: Patches, d: int) -> Iterator[tuple[NDArray[Any], Array]]:
-    """Nodes (stars, m) and inverses (stars, m d, m d) of this rank's stars, those of one size together. Collective."""
-    seen = np.unique(patches.node)
-    n = len(seen)
-    rows = PETSc.IS().createBlock(d, seen.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
-    (local,) = S.createSubMatrices([rows], [rows])
-    indptr, columns, values = local.getValuesCSR()
-    size = local.getSize()
-    local.destroy()
-    rows.destroy()
-    blocks = scipy.sparse.csr_matrix((values, columns, indptr), shape=size).tobsr((d, d))
-    del values, columns
-    blocks.sort_indices()
-    keys = np.repeat(np.arange(n, dtype=np.int64), np.diff(blocks.indptr)) * n + blocks.indices
-    for nodes in equal_stars(patches, d):
-        at = np.searchsorted(seen, nodes)
-        m = at.shape[1]
-        key = (at[:, :, None] * n + at[:, None, :]).ravel()
-        place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
-        data = np.where((keys[place] == key)[:, None, None], blocks.data[place], 0.0)
-        dense = data.reshape(-1, m, m, d, d).transpose(0, 1, 3, 2, 4).reshape(-1, m * d, m * d)
-        yield nodes, np.linalg.inv(dense)
-
-
-def equal_stars(patches: Patches, d: int) -> Iterator[NDArray[Any]]:
-    """Nodes (stars, m) of stars of one size, in parts whose inverses need little memory."""
-    sizes = np.unique(patches.star, return_counts=True)[1]
-    first = np.append(0, np.cumsum(sizes))
-    for m in np.unique(sizes):
-        stars = np.flatnonzero(sizes == m)
-        for part in np.array_split(stars, -(-len(stars) * 8 * (m * d) ** 2 // BYTES)):
-            yield patches.node[first[part][:, None] + np.arange(m)]
-
-
-def pattern(patches: Patches, comm: MPI.Intracomm, ranges: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Blocks in each owned row of nodes of B, with an own column and with another. Collective.
-
-    ``ranges``: first nodes of the ranks and the number of all.
-    """
-    count = int(ranges[-1])
-    parts = [np.unique(at[:, :, None] * count + at[:, None, :]) for at in equal_stars(patches, 1)]
-    key = np.unique(np.concatenate([*parts, np.zeros(0, dtype=np.int64)]))
-    owner = np.searchsorted(ranges, key // count, side="right") - 1
-    key = np.unique(to_ranks(comm, owner, key))
-    low, high = ranges[comm.rank], ranges[comm.rank + 1]
-    row, column = key // count - low, key % count
-    own = (column >= low) & (column < high)
-    blocks = [np.bincount(row[which], minlength=high - low).astype(PETSc.IntType) for which in (own, ~own)]
-    return blocks[0], blocks[1]

@@ -21,7 +21,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem import ITERATIVE, Array, Model, PETSc, Run, RunOptions, Scene, TissueMesh, build, digest
-from softgrasp.fem.solve.differences import Differences
+from softgrasp.fem.solve.differences import Differences, arrays_of
 from softgrasp.study.effects.result import Cost, ZeroCostCheck
 from softgrasp.study.effects.switch import neutral
 from softgrasp.study.shell import RepeatableRun, interleave, medians, rotated
@@ -66,7 +66,7 @@ def operator_hashes(model: Model, run: Run) -> dict[str, str]:
     matrices = {"M_ee": system.M_ee, "K_ee": system.K_ee, "S": run.midpoint.solver.S}
     if system.damping.matrix is not None:
         matrices["D_ee"] = system.damping.matrix
-    arrays: dict[str, list[Array]] = {name: list(A.getValuesCSR()) for name, A in matrices.items()}
+    arrays: dict[str, list[Array]] = {name: arrays_of(A) for name, A in matrices.items()}
     arrays |= {name: [getattr(system, name)] for name in ("T", "G", "M_hand", "M_rigid")}
     drive = getattr(run.drive, "drive", run.drive)  # without contact
     hand = (drive, getattr(drive, "step", None))
@@ -79,6 +79,8 @@ def matrix_memory(A: PETSc.Mat) -> float:
 
     Counted from its entries, for PETSc itself reports no memory in an optimised build.
     """
+    if A.getType() == "python":
+        return float(A.comm.tompi4py().allreduce(sum(array.nbytes for array in arrays_of(A))))
     integer = np.dtype(PETSc.IntType).itemsize
     entries = A.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_allocated"]
     block = A.getBlockSize() ** 2 if "baij" in A.getType() else 1
@@ -138,6 +140,8 @@ def memory_by_object(model: Model, run: Run) -> dict[str, float]:
     factored = solver.ksp.getOperators()[0]
     if factored.handle != solver.S.handle:
         sizes["S, factored"] = everywhere(matrix_memory(factored), factored)
+    if solver.stars is not None:
+        sizes["stars"] = sum(matrix_memory(A) for A in (*solver.stars.matrices[1:], solver.stars.P))
     if solver.name not in ITERATIVE and solver.S.comm.size == 1:  # factors spread over ranks are out of reach
         sizes["factor"] = everywhere(matrix_memory(solver.ksp.getPC().getFactorMatrix()), solver.S)
     return {name: size for name, size in sizes.items() if size > 0}

@@ -11,8 +11,9 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.solve import smoother, stars
+from softgrasp.fem.solve.smoother import Smoother
 from softgrasp.fem.solve.solvers import make_solver
-from softgrasp.fem.solve.stars import star_inverses
 from softgrasp.fem.solve.statics import equilibrium
 from softgrasp.fem.system import dynamic_stiffness
 from tests.helpers.models import CUBE, close, gather_matrix, gather_rows, local_rows, make_scene
@@ -56,34 +57,114 @@ def hats(model: Model) -> np.ndarray:
     return values
 
 
-@pytest.mark.serial
-@pytest.mark.parametrize("name", SCENES)
-def test_blocks_are_inverses_over_the_stars(name: str) -> None:
-    """A node lies in the open star of a vertex where the linear function of the vertex is positive."""
-    model = build(make_scene(*SCENES[name]), comm=MPI.COMM_SELF)
-    layout, d = model.system.layout, model.system.layout.dimension
-    S = dynamic_stiffness(model.system, 10.0)
-    dense = S.convert("dense", PETSc.Mat()).getDenseArray()
-    free = model.space.free
-    expected = np.zeros_like(dense)
-    functions = hats(model)[:, free]
-    for hat in functions:
+def inverse_blocks(model: Model, dense: np.ndarray) -> np.ndarray:
+    """B in double precision: a node lies in the open star of a vertex where the linear function of that is positive."""
+    d, result = model.system.layout.dimension, np.zeros_like(dense)
+    for hat in hats(model)[:, model.space.free]:
         nodes = np.flatnonzero(hat > 1e-9)  # shares of nodes are multiples of a third or a half
         if len(nodes):
             at = np.ix_(rows := (nodes[:, None] * d + np.arange(d)).ravel(), rows)
-            expected[at] += np.linalg.inv(dense[at])
+            result[at] += np.linalg.inv(dense[at])
+    return result
+
+
+def applied(product: Smoother, S: PETSc.Mat) -> np.ndarray:
+    """The matrix of a product on one rank."""
+    x, y = S.createVecs()
+    columns = []
+    for i in range(S.getSize()[0]):
+        x.array_w[:] = 0.0
+        x.array_w[i] = 1.0
+        product.mult(x, y)
+        columns.append(y.array_r.copy())
+    return np.column_stack(columns)
+
+
+@pytest.fixture(params=[True, False], ids=["compiled", "numpy"])
+def compiler(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """With and without a compiler."""
+    if not request.param:
+        for module in (smoother, stars):
+            monkeypatch.setattr(module, "product_code", lambda: None)
+    return bool(request.param)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.usefixtures("compiler")
+def test_blocks_are_inverses_over_the_stars(name: str) -> None:
+    model = build(make_scene(*SCENES[name]), comm=MPI.COMM_SELF)
+    layout, free = model.system.layout, model.space.free
+    S = dynamic_stiffness(model.system, 10.0)
+    expected = inverse_blocks(model, S.convert("dense", PETSc.Mat()).getDenseArray())
     assert layout.patches is not None
     patches = layout.patches()
-    found = np.zeros_like(dense)
-    for nodes, inverses in star_inverses(S, patches, d):
-        dofs = (d * nodes[:, :, None] + np.arange(d)).reshape(len(nodes), -1)
-        np.add.at(found, (dofs[:, :, None], dofs[:, None, :]), inverses)
-    assert close(found, expected) < 1e-12  # condition of a star below 1e3
+    found = applied(Smoother(S, patches, layout.dimension), S)
+    assert close(found, found.T) < 1e-14  # sums of about ten stars in double precision
+    # singles have 6e-8, and the root of the condition of a star is below 30
+    assert close(found, expected) < 2e-6
+    assert np.abs(found - expected).max() > 1e-12 * np.abs(expected).max()  # they are singles
     P = np.zeros((len(free), patches.count))
     P[patches.row, patches.column] = patches.weight
+    functions = hats(model)[:, free]
     vertex = [np.flatnonzero(np.isclose(hat, 1)) for hat in functions]
     mine = {int(v[0]): hat for v, hat in zip(vertex, functions, strict=True) if len(v)}
     assert close(P, np.array([mine[v] for v in patches.vertices]).T) < 1e-12
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_singles_keep_the_smoother_definite(scale: float) -> None:
+    """Layers 1e8 apart in stiffness, nu = 0.4999: cond of a star 1e12, of which singles of B itself keep nothing."""
+    layer = "tissue.layers.core={box=[[0.0, 0.0, 0.0], [0.05, 0.05, 0.03]], material={young=69e11, poisson=0.3, rho=1}}"
+    model = build("block_3d", [*silicone([2, 2, 3], 0.4999), layer], MPI.COMM_SELF)
+    S = dynamic_stiffness(model.system, 1.0)
+    S.scale(scale)
+    layout = model.system.layout
+    assert layout.patches is not None
+    found = applied(Smoother(S, layout.patches(), 3), S)
+    D = np.sqrt(S.getDiagonal().array_r)
+    found *= D[:, None] * D
+    found = (found + found.T) / 2
+    assert np.linalg.eigvalsh(found).min() > 1e-14 * np.linalg.norm(found, 2)  # rounding of the eigenvalues
+
+
+@pytest.mark.serial
+def test_an_indefinite_matrix_is_refused_and_the_earlier_one_stays() -> None:
+    system = build("block_3d", silicone([2, 2, 3]), MPI.COMM_SELF).system
+    solver = make_solver(dynamic_stiffness(system, 400.0), "stars", system.layout, "test_", 1e-10)
+    S = dynamic_stiffness(system, 400.0)
+    S.shift(-np.abs(S.getDiagonal().array_r).max())
+    assert not solver.renew(S)
+    r, w = solver.S.createVecs()
+    r.array_w[:] = system.G[:, 0]
+    solver.solve(r, w)
+    assert solver.residual(r, w) < 1.1e-10
+    solver.destroy()
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("s", [400.0, 0.0])
+def test_singles_cost_no_iterations(s: float) -> None:
+    """Against the same V-cycle with dense inverse blocks in double precision."""
+    model = build("block_3d", silicone([2, 2, 4]), MPI.COMM_SELF)
+    system, answers, counts = model.system, [], []
+    for double in (False, True):
+        S = dynamic_stiffness(system, s)
+        B = inverse_blocks(model, S.convert("dense", PETSc.Mat()).getDenseArray()) if double else None
+        solver = make_solver(S, "stars", system.layout, "test_", 1e-10)
+        if B is not None:
+            level = solver.ksp.getPC().getMGSmoother(1)
+            level.setOperators(solver.S, PETSc.Mat().createDense(B.shape, array=B, comm=MPI.COMM_SELF))
+            level.setUp()
+        r, w = solver.S.createVecs()
+        r.array_w[:] = system.G[:, 0]
+        solver.solve(r, w)
+        counts.append(solver.ksp.getIterationNumber())
+        answers.append(w.array_r.copy())
+        solver.destroy()
+    assert abs(counts[0] - counts[1]) <= 1
+    assert close(*answers) < 1e-7  # residual times the condition, about 1e3
 
 
 @pytest.mark.ranks
@@ -104,17 +185,20 @@ def test_solves_agree_with_a_dense_solve_on_any_ranks(comm: MPI.Intracomm, name:
 
 
 @pytest.mark.ranks
+@pytest.mark.usefixtures("compiler")
 def test_stars_are_whole_on_any_ranks(comm: MPI.Intracomm) -> None:
     """The matrix of their inverses is that of one rank, also where cells at a vertex are no ghosts of its owner."""
     found = []
     for ranks in (comm, MPI.COMM_SELF):
         system = build("block_3d", silicone([3, 3, 4]), ranks).system
-        solver = make_solver(dynamic_stiffness(system, 400.0), "stars", system.layout, "test_")
-        assert solver.stars is not None
-        B = solver.stars.matrices[1].convert("aij", PETSc.Mat())
-        found.append(gather_matrix(system.layout, B).toarray())
-        solver.destroy()
-    assert close(*found) < 1e-10  # condition of a star below 1e4
+        layout, S = system.layout, dynamic_stiffness(system, 400.0)
+        assert layout.patches is not None
+        x, y = S.createVecs()
+        x.array_w[:] = local_rows(layout, np.random.default_rng(4).standard_normal(layout.n_e))
+        Smoother(S, layout.patches(), 3).mult(x, y)
+        found.append(gather_rows(layout, y.array_r))
+    # factors of rows in another order: singles, times the root of the condition of a star, below 1e2
+    assert close(*found) < 1e-5
 
 
 @pytest.mark.ranks
