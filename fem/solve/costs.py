@@ -63,14 +63,14 @@ class Cost:
 
 # By solver, dimension and the order from which it holds. Messages of iterations are counted on 2 to 8 ranks, those of
 # a factor guessed. Times of direct solvers follow their entries: n log n and n^1.5 in 2D, n^(4/3) and n^2 in 3D, but
-# for the caches; memory of factors is nnz(L) of factor_bytes. With 4e5 unknowns in 2D cholesky takes 4.9 s and 60 ms,
-# MUMPS 2.7 s and 121 ms; beyond it was not measured. What iterates on P3 was measured at 9e3 and 2e4 unknowns, where
+# for the caches; memory of factors is nnz(L) of factor_bytes. With 1e6 unknowns in 2D cholesky takes 20 s and 0.19 s,
+# MUMPS 11 s and 0.37 s, and both the same memory; beyond it was not measured. What iterates on P3 was measured at 9e3 and 2e4 unknowns, where
 # factors take the time of P2 to 1.2; its memory follows the entries.
 COSTS: dict[tuple[SolverName, int, int], Cost] = {
-    ("cholesky", 2, 1): Cost((0.67, 1.5), (0.0127, 1.1), (800, 0.1), 5e5),
-    ("cholesky", 2, 2): Cost((0.9, 1.5), (0.017, 1.1), (1000, 0.1), 5e5),
-    ("mumps", 2, 1): Cost((0.40, 1.25), (0.030, 0.97), (1000, 0.1), 4e6, fixed=0.033, messages=100),
-    ("mumps", 2, 2): Cost((0.55, 1.25), (0.035, 0.97), (1250, 0.1), 4e6, fixed=0.033, messages=100),
+    ("cholesky", 2, 1): Cost((0.6, 1.5), (0.0125, 1.18), (800, 0.1), 1.2e6),
+    ("cholesky", 2, 2): Cost((0.57, 1.5), (0.0138, 1.12), (1000, 0.1), 1.2e6),
+    ("mumps", 2, 1): Cost((0.5, 1.33), (0.029, 1.1), (1000, 0.1), 4e6, fixed=0.033, messages=100),
+    ("mumps", 2, 2): Cost((0.6, 1.28), (0.0275, 1.07), (1250, 0.1), 4e6, fixed=0.033, messages=100),
     ("cg", 2, 1): Cost((0.25, 1.0), (0.006, 1.12), (600, 0.0), np.inf, iterations=(9, 9.6), messages=22),
     ("cg", 2, 2): Cost((0.6, 1.0), (0.02, 1.0), (1000, 0.0), np.inf, iterations=(16, 16), messages=22),
     ("stars", 2, 2): Cost((1.2, 1.0), (0.02, 1.0), (900, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),

@@ -20,7 +20,8 @@ SILICONE = 49.0  # lambda / mu at nu = 0.49
     [
         (1_000, 2, 1, False, 1.0, "cholesky"),
         (100_000, 2, 1, True, 1.0, "cholesky"),
-        (1_000_000, 2, 1, False, 1.0, "mumps"),
+        (1_000_000, 2, 1, False, 1.0, "cholesky"),
+        (2_000_000, 2, 1, False, 1.0, "mumps"),
         (10_000_000, 2, 1, False, 1.0, "cg"),
         (10_000_000, 2, 2, False, 1.0, "stars"),
         (3_000, 3, 2, False, SILICONE, "cholesky"),
