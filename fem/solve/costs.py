@@ -64,8 +64,8 @@ class Cost:
 # By solver, dimension and the order from which it holds. Messages of iterations are counted on 2 to 8 ranks, those of
 # a factor guessed. Times of direct solvers follow their entries: n log n and n^1.5 in 2D, n^(4/3) and n^2 in 3D, but
 # for the caches; memory of factors is nnz(L) of factor_bytes. With 1e6 unknowns in 2D cholesky takes 20 s and 0.19 s,
-# MUMPS 11 s and 0.37 s, and both the same memory; beyond it was not measured. What iterates on P3 was measured at 9e3 and 2e4 unknowns, where
-# factors take the time of P2 to 1.2; its memory follows the entries.
+# MUMPS 11 s and 0.37 s, and both the same memory; beyond it was not measured. What iterates on P3 was measured at 9e3
+# and 2e4 unknowns, where factors take the time of P2 to 1.2; its memory follows the entries.
 COSTS: dict[tuple[SolverName, int, int], Cost] = {
     ("cholesky", 2, 1): Cost((0.6, 1.5), (0.0125, 1.18), (800, 0.1), 1.2e6),
     ("cholesky", 2, 2): Cost((0.57, 1.5), (0.0138, 1.12), (1000, 0.1), 1.2e6),
