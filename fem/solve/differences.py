@@ -199,3 +199,9 @@ def as_matrix(product: Any, A: PETSc.Mat) -> PETSc.Mat:
     result = PETSc.Mat().createPython(A.getSizes(), Multiplied(product), comm=A.comm)
     result.setOption(PETSc.Mat.Option.SPD, True)
     return result
+
+
+def replace_product(A: PETSc.Mat, product: Any) -> None:
+    """Let a matrix from `as_matrix` multiply by another product."""
+    A.getPythonContext().product = product
+    A.stateIncrease()

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, petsc_options, user_options
-from softgrasp.fem.solve.differences import Differences, as_matrix, differences, product_code, require_same_code
+from softgrasp.fem.solve.differences import (
+    Differences,
+    as_matrix,
+    differences,
+    product_code,
+    replace_product,
+    require_same_code,
+)
 from softgrasp.fem.solve.smoother import Smoother
 
 DEGREE = 2  # degree of the Chebyshev polynomial: 3 saves a sixth of the iterations for 1.4 times the time
@@ -73,21 +80,30 @@ class Stars:
 
         Raises LinAlgError: S is not positive definite; what was set up before remains.
         """
-        d, ksp = self.layout.dimension, self.ksp
+        d, ksp, code = self.layout.dimension, self.ksp, product_code()
         blocks = Smoother(S, self.patches, d)
-        self._free()
+        entries = code is None or bool(user_options(ksp.getOptionsPrefix()))  # options may ask for them
+        new = S.convert("baij", PETSc.Mat()) if entries else differences(S, d, code, 1.0)
         linear = S.ptap(self.P)
         linear.setBlockSize(d)
         self._set_rigid_modes(linear)
         linear.setOption(PETSc.Mat.Option.SPD, True)
-        code, smoother = product_code(), as_matrix(blocks, S)
-        self.products = (blocks,)
-        if code is None or user_options(ksp.getOptionsPrefix()):  # which may ask for entries
-            fine = S.convert("baij", PETSc.Mat())
-            fine.setOption(PETSc.Mat.Option.SPD, True)
+        if self.matrices:  # the same objects, for multigrid keeps the matrix of its residual
+            fine, smoother, old = self.matrices
+            old.destroy()
+            for part in self.products:
+                part.destroy()
+            replace_product(smoother, blocks)
+            if isinstance(new, Differences):
+                replace_product(fine, new)
+            else:
+                new.copy(fine, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+                new.destroy()
         else:
-            pairs = differences(S, d, code, 1.0)
-            self.products, fine = (blocks, pairs), as_matrix(pairs, S)
+            fine = as_matrix(new, S) if isinstance(new, Differences) else new
+            fine.setOption(PETSc.Mat.Option.SPD, True)
+            smoother = as_matrix(blocks, S)
+        self.products = (blocks, new) if isinstance(new, Differences) else (blocks,)
         self.matrices = fine, smoother, linear
         ksp.setOperators(fine)
         pc = ksp.getPC()
@@ -139,11 +155,7 @@ class Stars:
 
     def destroy(self) -> None:
         """Free all matrices; the solver is its owner's. Collective."""
-        self._free()
-        self.P.destroy()
-
-    def _free(self) -> None:
-        for part in (*self.matrices, *self.products):
+        for part in (*self.matrices, *self.products, self.P):
             part.destroy()
 
 
