@@ -13,11 +13,12 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial, differs, of_layers
-from softgrasp.fem.petsc import Array, PETSc, combine, times_columns, total
+from softgrasp.fem.petsc import Array, PETSc, combine, rows_on_all, times_columns, total, whole_copy
 from softgrasp.fem.shown import Shown
 
 if TYPE_CHECKING:  # only scenes with finite strain, an own energy or the frame of a turning hand load them
@@ -170,6 +171,21 @@ class BlockSystem(Shown):
         matrix = layered_viscosity(self.layers, materials)
         damping = replace(self.damping, matrix=matrix, beta=materials[0].beta if matrix is None else 0.0)
         return replace(self, materials=materials, M_ee=M_ee, K_ee=K_ee, G=G, M_rigid=M_rigid, damping=damping, kept={})
+
+
+def whole_system(system: BlockSystem) -> BlockSystem:
+    """The same system with all rows on every rank, for what ranks do by themselves. Collective.
+
+    The affine components, and the points of finite strain, stay distributed and serve no rank alone.
+    """
+    layout, damping = system.layout, system.damping
+    nodes, held = rows_on_all(layout.comm, layout.nodes), rows_on_all(layout.comm, layout.held)
+    own = replace(layout, comm=MPI.COMM_SELF, n_local=layout.n_e, start=0, nodes=nodes, held=held, patches=None)
+    M_ee, K_ee = whole_copy(system.M_ee), whole_copy(system.K_ee)
+    T, G = rows_on_all(layout.comm, system.T), rows_on_all(layout.comm, system.G)
+    if damping.matrix is not None:
+        damping = replace(damping, matrix=whole_copy(damping.matrix))
+    return replace(system, layout=own, M_ee=M_ee, K_ee=K_ee, T=T, G=G, damping=damping, kept={})
 
 
 def sum_dense(terms: list[tuple[float, Array]]) -> Array:

@@ -50,8 +50,6 @@ class Design(Shown):
     """Warnings and estimated poles from before the solve."""
     gain_check: GainCheck
     """Comparison of any gain with the optimal one on the full plant."""
-    quality: LoopQuality
-    """Closed loop of the full plant under the optimal gain."""
     modal: bool
     """Whether the gain controls the lowest modes only."""
 
@@ -66,6 +64,11 @@ class Design(Shown):
             ("warnings", str(len(self.diagnosis.findings))),
         )
         return Card(f"Design {self.model.scene.name}", rows)
+
+    @property
+    def quality(self) -> LoopQuality:
+        """Closed loop of the full plant under the optimal gain. Collective at the first request."""
+        return self.gain_check.best
 
     @property
     def gain(self) -> Gain:
@@ -98,7 +101,12 @@ def check(model: Model) -> tuple[RiccatiProblem, Diagnosis, bool]:
 
 
 def design(
-    model: Model, watch: Stopwatch | None = None, progress: Progress | None = None, checkpoint: Path | None = None
+    model: Model,
+    watch: Stopwatch | None = None,
+    progress: Progress | None = None,
+    checkpoint: Path | None = None,
+    *,
+    judged: bool = True,
 ) -> Design:
     """Optimal feedback u = u_bar + K (x - x_bar), K = -R^-1 B'XE, of a scene, checked on the full plant. Collective.
 
@@ -106,6 +114,7 @@ def design(
         watch: records the seconds of "diagnosis", "are" and "judge".
         progress: called after every step of the solver with its history entry.
         checkpoint: folder for the solver's restart files.
+        judged: check the closed loop; a caller that does so with other gains calls :func:`judge` itself.
 
     Raises:
         SceneError: the scene names no target, or Q or R has the wrong size.
@@ -127,16 +136,25 @@ def design(
     with watch.stage("judge"):
         error = (start - target.state).block
         gain_check = GainCheck(plant, solution, error, law=sampling(model))
-        quality = gain_check.quality(solution.gain)
-    if quality.certified and not quality.abscissa < 0 and not modal:
+    result = Design(model, plant, solution, target, start, error, diagnosis, gain_check, modal)
+    if judged:
+        with watch.stage("judge"):
+            judge(result)
+    return result
+
+
+def judge(design: Design) -> None:
+    """Refuse a gain that does not stabilise the full plant at the scene's own step, rate and delay. Collective.
+
+    Raises SolverError: it does not.
+    """
+    quality = design.quality
+    if quality.certified and not quality.abscissa < 0 and not design.modal:
         raise SolverError(
             f"the gain leaves the closed loop with the spectral abscissa {quality.abscissa:.1e}/s, which must be "
             "negative; add damping, or try another control.method"
         )
-    result = Design(model, plant, solution, target, start, error, diagnosis, gain_check, quality, modal)
-    with watch.stage("judge"):
-        _require_sampled(result)
-    return result
+    _require_sampled(design)
 
 
 def _modal(plant: RiccatiProblem, diagnosis: Diagnosis) -> RiccatiSolution:

@@ -93,11 +93,10 @@ def reduce_gains(
                 notify(i * len(orders) + j, len(names) * len(orders))
         bases.append(BasisGains(name, family, tuple(reports)))
     best = _ranked(design, bases)
-    if not offered_only:
-        best = certified(design, best)
     n_s = design.problem.layout.n_s
     offered = range(2 * n_s + 2, fast_order(n_s) + 1)  # to the controller
-    return tuple(certified(design, [b], offered)[0] if b.name == A_PRIORI else b for b in best)
+    wanted: list[tuple[int, range | None]] = [] if offered_only else [(k, None) for k in range(len(best))]
+    return tuple(_examined(design, best, wanted + [(k, offered) for k, b in enumerate(best) if b.name == A_PRIORI]))
 
 
 def _ranked(design: Design, bases: Sequence[BasisGains]) -> list[BasisGains]:
@@ -119,16 +118,26 @@ def certified(design: Design, bases: Sequence[BasisGains], sizes: range | None =
 
     ``sizes``: orders of the gains that are offered; None for any.
     """
-    result = []
-    for b in bases:
-        reports = list(b.reports)
-        places = [i for i, r in enumerate(reports) if r.promising and (sizes is None or r.N in sizes)]
-        for i in sorted(places, key=lambda i: (reports[i].cost_excess, reports[i].N)):
-            reports[i] = design.gain_check.examined(reports[i])
-            if reports[i].stable:
-                break
-        result.append(replace(b, reports=tuple(reports)))
-    return result
+    return _examined(design, bases, [(k, sizes) for k in range(len(bases))])
+
+
+def _examined(
+    design: Design, bases: Sequence[BasisGains], wanted: Sequence[tuple[int, range | None]]
+) -> list[BasisGains]:
+    """The same for pairs of a basis and orders, the first gains of all pairs together. Collective."""
+    reports = [list(b.reports) for b in bases]
+    queues = []
+    for k, sizes in wanted:
+        places = [i for i, r in enumerate(reports[k]) if r.promising and (sizes is None or r.N in sizes)]
+        cheapest = sorted(places, key=lambda i: (reports[k][i].cost_excess, reports[k][i].N))
+        queues.append([(k, i) for i in cheapest])
+    while queues := [queue for queue in queues if queue]:
+        heads = list(dict.fromkeys(queue[0] for queue in queues))
+        known = design.gain_check.examined([reports[k][i] for k, i in heads])
+        for (k, i), report in zip(heads, known, strict=True):
+            reports[k][i] = report
+        queues = [[] if reports[k][i].stable else rest for (k, i), *rest in queues]
+    return [replace(b, reports=tuple(r)) for b, r in zip(bases, reports, strict=True)]
 
 
 def best_gains(bases: Sequence[BasisGains], layout: BlockLayout) -> list[GainReport]:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 
 from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, rows_on_all
 from softgrasp.fem.shown import Card, Shown, amount, listed
-from softgrasp.fem.system import BlockSystem
+from softgrasp.fem.system import BlockSystem, whole_system
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain
 
@@ -76,6 +76,13 @@ class RiccatiProblem(Shown):
     def M_s(self) -> Array:
         """Inertia that the input has to move, (n_s, n_s)."""
         return self.system.M_hand + (self.system.M_rigid if self.system.two_way else 0.0)
+
+
+def whole_problem(problem: RiccatiProblem) -> RiccatiProblem:
+    """The same problem with all rows on every rank, for what ranks do by themselves. Collective."""
+    comm, system = problem.layout.comm, whole_system(problem.system)
+    B_z = None if problem.B_z is None else rows_on_all(comm, problem.B_z)
+    return replace(problem, system=system, C_z=rows_on_all(comm, problem.C_z), B_z=B_z)
 
 
 @dataclass(frozen=True, repr=False)

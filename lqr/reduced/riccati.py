@@ -27,10 +27,10 @@ from softgrasp.lqr.plant.operators import (
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
 from softgrasp.lqr.reduced.ranking import modal_excess
-from softgrasp.lqr.spectrum.certificate import abscissa
+from softgrasp.lqr.spectrum.certificate import Abscissa
+from softgrasp.lqr.spectrum.divided import Certificates
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LoopQuality, ModalLoop, SampledRadius
 from softgrasp.lqr.spectrum.sampled import SampledLoop, Sampling, midpoint_radius
-from softgrasp.lqr.spectrum.tail import tail_modes, why_no_bound
 
 NAN = float("nan")
 
@@ -190,53 +190,63 @@ class GainCheck:
         self.start = start
         self.loop = ModalLoop(problem) if loop is None else loop
         self.law, self.ticks = law, SampledLoop(problem, self.loop)
-        self._shift: float | None = None  # of the certificate of the last gain, which the next one shares
+        self.certificates = Certificates(problem, solution.gain)
+        self._best: LoopQuality | SolverError | None = None
         self.optimal = float(np.sum(gram(problem.layout.comm, Z, descriptor(problem, start)) ** 2))
         if not self.optimal > 0:
             raise ControlError("the start is the target: nothing moves, so the cost of a gain cannot be compared")
 
     @cached_property
-    def _tail_modes(self) -> tuple[Array, Array] | None:
-        """Modes that the certificates of all gains share; None where there is no bound. Collective."""
-        return None if why_no_bound(self.problem) else tail_modes(self.problem)
+    def best(self) -> LoopQuality:
+        """Closed loop of the full plant under the optimal gain. Collective at the first request.
+
+        Raises SolverError: see :meth:`stabilities`.
+        """
+        if self._best is None:
+            (self._best,) = self.stabilities([self.solution.gain])
+        return self._with_cost(self._best, self.K)
 
     def quality(self, gain: Gain) -> LoopQuality:
         """Abscissa, excess cost and sampled radius of any gain. Collective.
 
         The cost is that of the continuous law, on the modes that ``loop`` keeps. Raises SolverError: see
-        :meth:`stability`.
+        :meth:`stabilities`.
         """
-        quality = self.stability(gain)
-        excess = self._modal(self.loop, gain.block).cost_excess if quality.abscissa < 0 else np.inf
+        return self._with_cost(self.stabilities([gain])[0], gain.block)
+
+    def _with_cost(self, quality: LoopQuality | SolverError, K: Block) -> LoopQuality:
+        if isinstance(quality, SolverError):
+            raise quality
+        excess = self._modal(self.loop, K).cost_excess if quality.abscissa < 0 else np.inf
         return replace(quality, cost_excess=excess)
 
-    def stability(self, gain: Gain) -> LoopQuality:
-        """Abscissa and sampled radius of any gain, without its cost. Collective.
+    def stabilities(self, gains: Sequence[Gain]) -> list[LoopQuality | SolverError]:
+        """Abscissa and sampled radius of any gains, without their cost. Collective.
 
         Plants of no more modes than ``loop`` keeps use all. Larger ones have the abscissa from
-        :func:`softgrasp.lqr.spectrum.certificate.abscissa`; where the certificate fails, all modes are used up to
-        :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`.
-
-        Raises SolverError: no eigenvalue converges, and there are too many modes to use all.
+        :class:`softgrasp.lqr.spectrum.divided.Certificates`; where the certificate fails, all modes are used up to
+        :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`. Beyond, a gain of which no eigenvalue converges has the
+        error in its place.
         """
-        K = gain.block
         if self.loop.complete:
-            return self._of_poles(K, self.loop)
-        fits = self.problem.layout.n_e <= DENSE_LIMIT
-        try:
-            spectrum = abscissa(self.problem, gain, self._tail_modes, self._shift)
-            self._shift = spectrum.shift
-        except SolverError:
+            return [self._of_poles(gain.block, self.loop) for gain in gains]
+        return [self._judged(*pair) for pair in zip(gains, self.certificates.of(gains), strict=True)]
+
+    def _judged(self, gain: Gain, spectrum: Abscissa | SolverError) -> LoopQuality | SolverError:
+        """Quality of a gain by its certificate, or by all modes where it fails and they fit. Collective."""
+        K, fits = gain.block, self.problem.layout.n_e <= DENSE_LIMIT
+        if isinstance(spectrum, SolverError):
             if not fits:
-                raise
-            spectrum = None
-        if spectrum is None or (fits and not spectrum.certified):
-            whole = self.ticks.modes(whole=True)
-            if spectrum is None:  # nor would it converge for the next gain
-                self.loop = whole
-            return self._of_poles(K, whole)
+                return spectrum
+            self.loop = self.ticks.modes(whole=True)  # nor would it converge for the next gain
+            return self._of_poles(K, self.loop)
+        if fits and not spectrum.certified:
+            return self._of_poles(K, self.ticks.modes(whole=True))
         poles = spectrum.eigenvalues
-        return self._sampled(K, LoopQuality(spectrum.value, NAN, spectrum.certified, spectrum.exact, poles))
+        try:
+            return self._sampled(K, LoopQuality(spectrum.value, NAN, spectrum.certified, spectrum.exact, poles))
+        except SolverError as error:
+            return error
 
     def _of_poles(self, K: Block, loop: ModalLoop) -> LoopQuality:
         """Quality of a gain from the modes that a loop keeps; certain where they are all. Collective."""
@@ -297,17 +307,26 @@ class GainCheck:
             examined=self.loop.complete,
         )  # fmt: skip
 
-    def examined(self, report: GainReport) -> GainReport:
-        """The report with the spectrum of the full plant; not certified where it does not converge. Collective."""
-        if report.examined or report.gain is None:
-            return report
-        try:
-            known = self.stability(report.gain)
-        except SolverError:
-            return replace(report, certified=False, examined=True)
-        return replace(
-            report, abscissa_full=known.abscissa, certified=known.certified, sampled=known.sampled, examined=True
-        )
+    def examined(self, reports: Sequence[GainReport]) -> list[GainReport]:
+        """The reports with the spectrum of the full plant; not certified where it does not converge. Collective.
+
+        The optimal gain is examined beside them if it was not before.
+        """
+        gains = {i: r.gain for i, r in enumerate(reports) if not r.examined and r.gain is not None}
+        first = [self.solution.gain] if self._best is None and gains else []
+        known = self.stabilities([*first, *gains.values()])
+        if first:
+            self._best, *known = known
+        result = list(reports)
+        for i, quality in zip(gains, known, strict=True):
+            if isinstance(quality, SolverError):
+                result[i] = replace(reports[i], certified=False, examined=True)
+                continue
+            result[i] = replace(
+                reports[i], abscissa_full=quality.abscissa, certified=quality.certified, sampled=quality.sampled,
+                examined=True,
+            )  # fmt: skip
+        return result
 
     def with_quality[Figures: GainQuality](self, report: Figures, gain: Gain) -> Figures:
         """The report with errors, poles and cost of a gain. Collective. Raises SolverError: see :meth:`quality`."""

@@ -108,11 +108,17 @@ def abscissa(
     tail = None if why else TailBound(problem, K, modes)
     # the same bits on every rank: they decide how often all search
     aim, own, guess = problem.layout.comm.bcast(_circle(problem, tail))
-    for sigma in (own,) if shift is None else (shift, own):
+    for sigma in dict.fromkeys((own,) if shift is None else (shift, own)):
         result = _searched(problem, K, tail, why, aim, sigma, guess)
         if result.certified or why:
             break
     return result
+
+
+def centre(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | None) -> float:
+    """The own shift sigma of a gain [1/s], see :func:`abscissa`. Collective."""
+    tail = None if why_no_bound(problem) else TailBound(problem, gain.block, modes)
+    return float(problem.layout.comm.bcast(_circle(problem, tail)[1]))
 
 
 def _searched(

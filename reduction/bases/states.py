@@ -7,13 +7,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 
 from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, rows_on_all, times_columns, total, whole_copy
+from softgrasp.fem.petsc import Array, rows_on_all, times_columns, total
 from softgrasp.fem.run.states.snapshots import Snapshots
-from softgrasp.fem.system import BlockSystem
+from softgrasp.fem.system import BlockSystem, whole_system
 from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError
 
 
@@ -104,25 +103,18 @@ class States:
 def whole_states(states: States) -> States:
     """The same states with all rows on every rank, for bases that each rank makes by itself. Collective.
 
-    Bases that use affine components, layers or damping of the system cannot be made from them.
+    Bases that use affine components or layers of the system cannot be made from them.
     """
-    layout = states.layout
-    comm, n = layout.comm, layout.n_local
-    nodes, held = rows_on_all(comm, layout.nodes), rows_on_all(comm, layout.held)
-    own = replace(layout, comm=MPI.COMM_SELF, n_local=layout.n_e, start=0, nodes=nodes, held=held, patches=None)
-
-    def whole(system: BlockSystem) -> BlockSystem:
-        M_ee, K_ee = whole_copy(system.M_ee), whole_copy(system.K_ee)
-        T, G = rows_on_all(comm, system.T), rows_on_all(comm, system.G)
-        return replace(system, layout=own, M_ee=M_ee, K_ee=K_ee, T=T, G=G, kept={})
+    comm, n, system = states.layout.comm, states.layout.n_local, whole_system(states.system)
+    own = system.layout
 
     def gathered(snapshots: Snapshots) -> Snapshots:
         Z = np.empty((2 * own.n_e, snapshots.Z.shape[1]), order="F")
         Z[: own.n_e], Z[own.n_e :] = rows_on_all(comm, snapshots.Z[:n]), rows_on_all(comm, snapshots.Z[n:])
         return replace(snapshots, layout=own, Z=Z)
 
-    runs = tuple((whole(system), gathered(snapshots)) for system, snapshots in states.runs)
-    return States(whole(states.system), runs)
+    runs = tuple((whole_system(run), gathered(snapshots)) for run, snapshots in states.runs)
+    return States(system, runs)
 
 
 def states_of(system: BlockSystem, snapshots: Snapshots | None = None) -> States:

@@ -15,7 +15,7 @@ from rich.progress import Progress, TaskProgressColumn
 from softgrasp.fem import Loop, Model, Scene, SceneError, Stopwatch, remove_own, scene_hash, sharing_factors
 from softgrasp.lqr import A_PRIORI, Design, PlantState, control_of, finite_problem, linearised, with_control
 from softgrasp.lqr.design.duration import plan
-from softgrasp.lqr.design.feedback import design
+from softgrasp.lqr.design.feedback import design, judge
 from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, reduce_gains
 from softgrasp.study.control import measure, report
 from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
@@ -75,7 +75,7 @@ def run_control(
         observed, study = None, cast(GainStudy | None, None)
         _require(plant)
         with sharing_factors(plant.system):
-            feedback = design(plant, watch, solver_bar(bar, model), restart)
+            feedback = design(plant, watch, solver_bar(bar, model), restart, judged=not gain_only)
             if control_of(model).observer is not None:
                 from softgrasp.study.control.observer.measure import observed_study
 
@@ -142,6 +142,8 @@ def small_study(feedback: Design, watch: Stopwatch, note: str) -> GainStudy:
     if not feedback.modal:
         with watch.stage("reduced"):
             bases = reduce_gains(feedback, orders(feedback)[0], names=(A_PRIORI,), offered_only=True)
+    with watch.stage("judge"):
+        judge(feedback)  # its certificate was made beside that of a reduced gain
     return measure.gain_study(feedback, bases, note, WITHOUT_CONTACT if feedback.model.scene.effects.obstacles else "")
 
 
