@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -204,27 +205,41 @@ def driven_by_root(
     return on_root(comm, lead)
 
 
-def folded[R](comm: MPI.Intracomm, part: R, fold: Callable[[R, R], R]) -> R:
-    """Parts of all ranks, folded two at a time in a tree, in the order of the ranks; right on rank 0. Collective."""
+def folded[R](comm: MPI.Intracomm, make: Callable[[], R], fold: Callable[[R, R], R]) -> R:
+    """Parts that ranks make, folded two at a time in a tree, in the order of the ranks; right on rank 0. Collective.
+
+    Raises Exception: what making or folding raises on one rank, on every rank.
+    """
+    part, failure = _tried(make)
     step = 1
     while step < comm.size:
         place = comm.rank % (2 * step)
         if place == step:
-            comm.send(part, comm.rank - step)
+            comm.send((part, failure), comm.rank - step)
         elif place == 0 and comm.rank + step < comm.size:
-            part = fold(part, comm.recv(source=comm.rank + step))
+            other, later = comm.recv(source=comm.rank + step)
+            failure = failure or later
+            if failure is None:
+                part, failure = _tried(partial(fold, part, other))
         step *= 2
+    meet(comm)
+    failure = comm.bcast(failure)
+    if failure is not None:
+        raise failure
     return part
+
+
+def _tried(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
+    """What a call returns, and what it raises."""
+    try:
+        return call(), None
+    except Exception as error:
+        return None, error
 
 
 def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:
     """Run small dense work on rank 0 and broadcast what it returns or raises. Collective."""
-    answer: tuple[Any, Exception | None] = (None, None)
-    if comm.rank == 0:
-        try:
-            answer = (call(), None)
-        except Exception as error:
-            answer = (None, error)
+    answer = _tried(call) if comm.rank == 0 else (None, None)
     meet(comm)
     result, failure = comm.bcast(answer) if comm.size > 1 else answer
     if failure is not None:

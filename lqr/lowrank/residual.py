@@ -80,10 +80,14 @@ def _fill_tissue(problem: RiccatiProblem, Z: Block, top: Array, bottom: Array) -
 
 def _triangular(comm: MPI.Intracomm, U: Array) -> Array:
     """R of the thin QR factorisation of rows spread over the ranks, right on rank 0. Collective."""
-    r = _reduced([U[:ROWS]])
-    for first in range(ROWS, len(U), ROWS):
-        r = _reduced([r, U[first : first + ROWS]])
-    return folded(comm, r, lambda upper, lower: _reduced([upper, lower]))
+
+    def own() -> Array:
+        r = _reduced([U[:ROWS]])
+        for first in range(ROWS, len(U), ROWS):
+            r = _reduced([r, U[first : first + ROWS]])
+        return r
+
+    return folded(comm, own, lambda upper, lower: _reduced([upper, lower]))
 
 
 def _reduced(parts: Sequence[Array]) -> Array:

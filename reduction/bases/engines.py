@@ -191,10 +191,14 @@ def triangle(comm: MPI.Intracomm, X: Array, top: Array | None = None) -> Array:
         X: local rows (n_local, k).
         top: rows above those of rank 0, known to every rank.
     """
-    R = np.zeros((0, X.shape[1])) if top is None or comm.rank else top
-    for i in range(0, len(X), BLOCK_ROWS):
-        R = np.linalg.qr(np.vstack([R, X[i : i + BLOCK_ROWS]]), mode="r")
-    R = folded(comm, R, lambda upper, lower: np.linalg.qr(np.vstack([upper, lower]), mode="r"))
+
+    def own() -> Array:
+        R = np.zeros((0, X.shape[1])) if top is None or comm.rank else top
+        for i in range(0, len(X), BLOCK_ROWS):
+            R = np.linalg.qr(np.vstack([R, X[i : i + BLOCK_ROWS]]), mode="r")
+        return R
+
+    R = folded(comm, own, lambda upper, lower: np.linalg.qr(np.vstack([upper, lower]), mode="r"))
     return on_root(comm, lambda: R)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import softgrasp.lqr.reduced.riccati
+import softgrasp.lqr.spectrum.divided
 from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.design.feedback import design
@@ -59,9 +59,9 @@ def test_the_best_gain_of_a_basis_is_examined_and_no_other(monkeypatch: pytest.M
     made = design(build(load_scene(SCENE, ["tissue.cells=[8,16]", "control.N=[4,8,12,20]"])))
     check, asked = made.gain_check, list[Any]()
     assert not check.loop.complete
-    real = softgrasp.lqr.reduced.riccati.abscissa
+    real = softgrasp.lqr.spectrum.divided.abscissa
     monkeypatch.setattr(
-        softgrasp.lqr.reduced.riccati, "abscissa", lambda *arguments: asked.append(1) or real(*arguments)
+        softgrasp.lqr.spectrum.divided, "abscissa", lambda *arguments: asked.append(1) or real(*arguments)
     )
     bases = reduce_gains(made, [4, 8, 12, 20], names=("pod_decomposed", A_PRIORI))
     assert len(asked) <= 3  # the best of each, and of small order for the controller
