@@ -247,12 +247,12 @@ class AskedSolver:
             )
 
 
-def block_solves(factor: PETSc.Mat, S: PETSc.Mat, X: NDArray[Any]) -> NDArray[Any]:
+def block_solves(factor: PETSc.Mat, X: NDArray[Any]) -> NDArray[Any]:
     """S^-1 X of local rows (n_local, k) by a factor of S that takes several columns at once (MUMPS). Collective."""
     result = np.empty(X.shape, order="F")
     for first in range(0, X.shape[1], WIDTH):
         part = np.asfortranarray(X[:, first : first + WIDTH])
-        B = PETSc.Mat().createDense((S.getSizes()[0], (None, part.shape[1])), array=part, comm=S.comm)
+        B = PETSc.Mat().createDense((factor.getSizes()[0], (None, part.shape[1])), array=part, comm=factor.comm)
         solved = B.duplicate()
         factor.matSolve(B, solved)
         result[:, first : first + WIDTH] = solved.getDenseArray(readonly=True)
@@ -311,15 +311,22 @@ class OrderedFactor:
         self.factor.solve(self.r, self.w)
         self.w_nodes.take(self.places, 0, w.array_w.reshape(-1, d), "clip")
 
-    def columns(self, X: NDArray[Any]) -> NDArray[Any]:
-        """S^-1 X of local rows (n_local, k), Fortran order; each rank solves every size-th column. Collective."""
+    def columns(self, X: NDArray[Any], at_once: bool = False) -> NDArray[Any]:
+        """S^-1 X of local rows (n_local, k), Fortran order; each rank solves every size-th column. Collective.
+
+        ``at_once``: several columns in one solve, by a factor of MUMPS.
+        """
         comm = self.comm
-        whole, mine = rows_on_all(comm, X), range(comm.rank, X.shape[1], comm.size)
-        solved = np.empty((whole.shape[0], len(mine)), order="F")
-        for i, j in enumerate(mine):
-            self.r.array_w[:] = self.order.enter(whole[:, j])
-            self.factor.solve(self.r, self.w)
-            solved[:, i] = self.order.leave(self.w.array_r)
+        own = self.order.enter(rows_on_all(comm, X)[:, comm.rank :: comm.size])
+        if at_once:
+            solved = block_solves(self.factor, own)
+        else:
+            solved = np.empty(own.shape, order="F")
+            for i in range(own.shape[1]):
+                self.r.array_w[:] = own[:, i]
+                self.factor.solve(self.r, self.w)
+                solved[:, i] = self.w.array_r
+        solved = self.order.leave(solved)
         result, ends = np.empty(X.shape, order="F"), np.cumsum(self.counts)
         parts = comm.alltoall([np.ascontiguousarray(part) for part in np.split(solved, ends[:-1])])
         for rank, part in enumerate(parts):

@@ -141,10 +141,11 @@ class TissueSolver:
         result = np.zeros(X.shape, order="F")
         some = np.flatnonzero(total(self.S.comm.tompi4py(), np.abs(X).sum(axis=0)) != 0)
         block = None
+        at_once = self.name == "mumps" and not user_options(self.ksp.getOptionsPrefix())
         if isinstance(self.factor, OrderedFactor) and len(some) > 1:  # each rank has the whole factor for some of them
-            block = self.factor.columns
-        elif self.name == "mumps" and len(some) > 1 and not user_options(self.ksp.getOptionsPrefix()):
-            block = partial(block_solves, self.ksp.getPC().getFactorMatrix(), self.S)
+            block = partial(self.factor.columns, at_once=at_once)
+        elif at_once and len(some) > 1:
+            block = partial(block_solves, self.ksp.getPC().getFactorMatrix())
         if block is not None and len(some):
             result[:, some] = block(X[:, some])
         try:
