@@ -210,6 +210,7 @@ def folded[R](comm: MPI.Intracomm, make: Callable[[], R], fold: Callable[[R, R],
 
     Raises Exception: what making or folding raises on one rank, on every rank.
     """
+    part: Any
     part, failure = _tried(make)
     step = 1
     while step < comm.size:
@@ -226,7 +227,8 @@ def folded[R](comm: MPI.Intracomm, make: Callable[[], R], fold: Callable[[R, R],
     failure = comm.bcast(failure)
     if failure is not None:
         raise failure
-    return part
+    result: R = part
+    return result
 
 
 def _tried(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
@@ -241,11 +243,11 @@ def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:
     """Run small dense work on rank 0 and broadcast what it returns or raises. Collective."""
     answer = _tried(call) if comm.rank == 0 else (None, None)
     meet(comm)
-    result, failure = comm.bcast(answer) if comm.size > 1 else answer
+    value, failure = comm.bcast(answer) if comm.size > 1 else answer
     if failure is not None:
         raise failure
-    value: R = result
-    return value
+    result: R = value
+    return result
 
 
 def to_ranks(comm: MPI.Intracomm, rank: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[np.int64]:

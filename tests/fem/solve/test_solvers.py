@@ -45,7 +45,7 @@ def test_mumps_is_mumps_on_any_ranks(comm: MPI.Intracomm, reproducible: bool) ->
 @pytest.mark.ranks
 @pytest.mark.parametrize("name", ["cholesky", "mumps"])
 def test_columns_are_divided_between_ranks(comm: MPI.Intracomm, name: SolverName) -> None:
-    """Each rank has a share of the solves, which have the bits of one after the other but for MUMPS' several at once."""
+    """Each rank has a share of the solves, which have the bits of one after the other but for MUMPS' blocks."""
     system = build(make_scene(CUBE), comm=comm).system
     solver = make_solver(system.K_ee.copy(), name, system.layout, "test_", reproducible=True)
     X = np.random.default_rng(2).standard_normal((system.layout.n_e, 7))
