@@ -241,6 +241,7 @@ def _tried(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
 
 def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:
     """Run small dense work on rank 0 and broadcast what it returns or raises. Collective."""
+    value: Any
     answer = _tried(call) if comm.rank == 0 else (None, None)
     meet(comm)
     value, failure = comm.bcast(answer) if comm.size > 1 else answer
