@@ -39,13 +39,19 @@ class SampledRadius:
 class LoopQuality(Shown):
     """The full plant under one gain."""
 
-    abscissa: float  # largest real part of the closed-loop spectrum, or a lower bound where not ``exact`` [1/s]
-    cost_excess: float  # excess cost J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable
-    # whether the sign of ``abscissa`` is proved: by the whole spectrum, or softgrasp.lqr.spectrum.certificate.abscissa
+    abscissa: float
+    """Largest real part of the closed-loop spectrum, or a lower bound where not ``exact`` [1/s]."""
+    cost_excess: float
+    """Excess cost J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable."""
     certified: bool = True
-    exact: bool = True  # whether the abscissa of the whole spectrum exceeds ``abscissa`` by at most a thousandth
-    poles: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=complex))  # computed eigenvalues [1/s], (k,)
-    sampled: SampledRadius | None = None  # radius from tick to tick; None where the instants are unknown
+    """Whether the sign of ``abscissa`` is proved, by the whole spectrum or
+    :func:`softgrasp.lqr.spectrum.certificate.abscissa`."""
+    exact: bool = True
+    """Whether the abscissa of the whole spectrum exceeds ``abscissa`` by at most a thousandth of it."""
+    poles: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=complex))
+    """Computed eigenvalues [1/s], (k,)."""
+    sampled: SampledRadius | None = None
+    """Radius from tick to tick; None where the instants are unknown."""
 
     @property
     def stable(self) -> bool:
