@@ -18,7 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-LAWS = Path(__file__).with_name("strain")  # of law.h, which every source includes
+SHARED = Path(__file__).with_name("strain") / "law.h", Path(__file__).with_name("sum.h")  # any source may include them
 LANES = 8  # points that the C code treats at a time
 FLAGS = (f"-DLANES={LANES}", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 
@@ -33,7 +33,7 @@ def library(
         source: C file.
         declaration: of its functions, for cffi.
         otherwise: the way that is used instead, begins the warning.
-        headers: files beside law.h that it includes.
+        headers: files beside `SHARED` that it includes.
         defined: macros, NAME=VALUE.
     """
 
@@ -74,8 +74,8 @@ def _shared(source: Path, headers: tuple[Path, ...], macros: tuple[str, ...]) ->
     compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
         raise OSError("there is no C compiler")
-    folders = [f"-I{folder}" for folder in dict.fromkeys((LAWS, *(header.parent for header in headers)))]
-    files = [source, LAWS / "law.h", *headers]
+    files = [source, *SHARED, *headers]
+    folders = [f"-I{folder}" for folder in dict.fromkeys(header.parent for header in files[1:])]
     texts = *(file.read_text() for file in files), compiler, *FLAGS, *macros, _processor()
     key = hashlib.sha256("\0".join(texts).encode()).hexdigest()[:20]
     root = cache_folder()

@@ -3,6 +3,7 @@
 #include "flat.h"
 
 #include "pivots.h"
+#include "sum.h"
 
 static const double *along(const Flat *f, const int *row) {
   return f->along + (size_t)(row[0] * (1 + f->m) + row[3]) * f->d;
@@ -20,7 +21,7 @@ double softgrasp_look(const Flat *f) {
   if (f->whole)
     for (int u = 0; u < size; u++) f->moved[u] = f->w[f->at[u]];
   for (int u = 0; u < size; u++) {
-    x[u] = f->X[u] + (f->z[u] + 2 * f->moved[u] + x[u]);
+    x[u] = f->X[u] + (f->z[u] + (2 * f->moved[u] + f->low[u]) + x[u]);
     if (fabs(x[u]) > most[u % 4]) most[u % 4] = fabs(x[u]);
   }
   for (int o = 0; o < f->obstacles; o++) {
@@ -177,7 +178,7 @@ static void account(const Flat *f, int n) {
 
 /* Carry the boundary on to the end of step n; r takes N'x once more, as it takes G c. */
 static void carry(const Flat *f, int n) {
-  for (int u = 0; u < f->p * f->d; u++) f->z[u] += 2 * f->moved[u];
+  for (int u = 0; u < f->p * f->d; u++) f->z[u] = exact_sum(f->z[u], 2 * f->moved[u] + f->low[u], f->low + u);
   memcpy(f->gap, f->after, sizeof(double) * f->obstacles * f->p);
   memcpy(f->gaps + (size_t)(n + 1) * f->obstacles, f->least, sizeof(double) * f->obstacles);
   for (int j = 0; f->pressed && j < f->k; j++)

@@ -25,7 +25,8 @@ typedef struct {
   const int *at;            /* row here of each unknown of the boundary, -1 where another rank has it (p d) */
   const int *rows;          /* the same of the state, where one rank has all (p d) */
   double *w, *r;            /* half the change of z in the step, and its right-hand side (n) */
-  double *z, *moved, *v;    /* displacement, its half change and velocity of the boundary (p d) */
+  double *z, *low;          /* displacement of the boundary, and what it lacks (p d) */
+  double *moved, *v;        /* its half change in the step and its velocity (p d) */
   double *qs, *vs, *cs;     /* hand, its velocity (steps + 1, n_s) and its load (steps, n_s) */
   const double *q, *q0;     /* hand at the end of the step and at the start of it (n_s) */
   const double *slide;      /* way of the half-spaces in the step (obstacles, d) */

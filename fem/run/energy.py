@@ -35,6 +35,19 @@ def wide_product(A: PETSc.Mat, x: Array) -> NDArray[np.longdouble]:
     return result
 
 
+def wide_pull(midpoint: TissueMidpoint, state: TissueState) -> tuple[NDArray[np.longdouble], NDArray[np.longdouble]]:
+    """Both words of z, and K z, on the owned rows in the widest type of NumPy. Collective."""
+    system, n = midpoint.system, midpoint.system.layout.n_local
+    low, y = state.z.duplicate(), state.z.duplicate()
+    low.array_w[:] = midpoint.low.array_r[midpoint.operators.rows]
+    system.K_ee.mult(low, y)
+    z = state.array[:n].astype(np.longdouble) + low.array_r
+    pull = wide_product(system.K_ee, rows_on_all(system.layout.comm, state.array[:n])) + y.array_r
+    for vector in (low, y):
+        vector.destroy()
+    return z, pull
+
+
 def exact_energy(midpoint: TissueMidpoint, state: TissueState) -> float:
     """Energy (z'K z + pi'M^-1 pi) / 2 [J] of the momentum that a linear step carries, s pi = h + K z - f. Collective.
 
@@ -43,10 +56,9 @@ def exact_energy(midpoint: TissueMidpoint, state: TissueState) -> float:
     of K have over those of the product.
     """
     system, n = midpoint.system, midpoint.system.layout.n_local
-    z, v = state.array[:n], state.array[n:]
-    pull, momentum = (
-        wide_product(A, rows_on_all(system.layout.comm, x)) for A, x in ((system.K_ee, z), (system.M_ee, v))
-    )
+    v = state.array[n:]
+    z, pull = wide_pull(midpoint, state)
+    momentum = wide_product(system.M_ee, rows_on_all(system.layout.comm, v))
     h = midpoint.r_array[midpoint.operators.rows] + system.G.astype(np.longdouble) @ midpoint.pending
     f = 0.0 if system.own_load is None else system.own_load
     twice = z @ pull + v @ (2 / np.longdouble(midpoint.s) * (h + pull - f) - momentum)

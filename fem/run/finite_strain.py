@@ -133,7 +133,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
     def energy(self, state: TissueState) -> float:
         """Energy W(z) + v'pi/2 [J] of the state just reached. Collective."""
         W = self.over_ranks(self.body.energy(self._held_z(state)))
-        v, momentum = state.array[len(self.x_array) :], self.r_array[self.rows] / self.s
+        v, momentum = state.array[self.system.layout.n_local :], self.r_array[self.rows] / self.s
         return W + float(total(self.comm, np.array([np.dot(v, momentum)]))[0]) / 2
 
     def figures(self) -> NewtonFigures:

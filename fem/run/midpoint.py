@@ -3,7 +3,7 @@
 With s = 2/dt, w = z_mid - z_n, momentum pi = M_ee v and the load l = G c at the midpoint,
 
     S w = r,   r = h_n + G c_n,   h_n = s pi_n - K z_n,   S = K + s D + s^2 M,
-    z_{n+1} = z_n + 2 w,   v_{n+1} = 2 s w - v_n,
+    z_{n+1} = z_n + 2 w,   v_{n+1} = 2 s w - v_n      (:mod:`softgrasp.fem.run.displacement`),
     s pi_{n+1} = a S w - a (1 + s beta) (K z_{n+1} - K z_n) / 2 - s pi_n,   a = 2 s / (s + alpha)
 
 for D = alpha M + beta K. The textbook form computes pi_{n+1} as M v_{n+1} instead: a second product, and the rounding
@@ -16,14 +16,14 @@ G c_n, waits for the next load, so that a step adds G to r once: r_{n+1} = (h_{n
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
 from softgrasp.fem.petsc import SAME, Array, PETSc, combine, total
+from softgrasp.fem.run.displacement import Displacement
+from softgrasp.fem.solve.differences import Differences
 from softgrasp.fem.solve.replicated import replicated_operators
 from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
 from softgrasp.fem.system import BlockSystem, dynamic_stiffness
@@ -95,7 +95,8 @@ class TissueMidpoint:
         pending: coefficients p of the load that r still lacks between steps, h = r + G p, (n_s,).
         K2: -2 K, whose product one call adds to r, see :mod:`softgrasp.fem.solve.differences`.
         k: K2 z, on the rows here [N]; carried from step to step where damping is on; ``k_array`` is its array.
-        x: the rows of w that this rank owns, in the order of the state; w itself unless the vectors are whole here.
+        z: z on the rows here where these are all rows; else None, and the state has it.
+        low: what z lacks, see :mod:`softgrasp.fem.run.displacement`, on the rows here [m].
     """
 
     SUBTREES: ClassVar[bool] = True
@@ -127,12 +128,12 @@ class TissueMidpoint:
         self._couple()
         own = system.own_load
         self.own: Array | None = None if own is None else np.asarray(self.operators.gather(own))
-        self.x, self._move = self.w, self._held_z
-        if self.operators.whole:
-            self.x, self.z = system.K_ee.createVecRight(), self.w.duplicate()
-            self._move = self._move_whole
-        self.x_array: Array = self.x.array_w
-        self._pick = self._picker()
+        self.z: PETSc.Vec | None = self.w.duplicate() if self.operators.whole else None
+        self.low = self.w.duplicate()
+        self.low.set(0.0)
+        # K (z + low) needs compiled code
+        self._lows = (self.low,) if isinstance(self.K2, Differences) else ()
+        self.displacement = self._make_displacement()
         self.dissipated = 0.0
         self.spare: list[PETSc.Vec] = []  # of velocity.py, made once a run
         self._prepare()
@@ -155,16 +156,12 @@ class TissueMidpoint:
             self.k_old_array = self.k_old.array_r
             self._propagate = self._proportional
 
-    def _picker(self) -> Callable[[], object]:
-        """Function that copies the owned rows of w to x."""
-        layout, order = self.system.layout, self.operators.order
-        if order is not None:
-            w, x = (array.reshape(-1, order.d) for array in (self.w_array, self.x_array))
-            places = order.places_of(layout.start, layout.start + layout.n_local)
-            return partial(w.take, places, 0, x, "clip")  # "raise" would copy x
-        if self.operators.whole:
-            return partial(np.copyto, self.x_array, self.w_array[self.rows])
-        return lambda: None  # x is w
+    def _make_displacement(self) -> Displacement:
+        layout, order, z = self.system.layout, self.operators.order, self.z
+        d = layout.dimension
+        own = layout.start // d, (layout.start + layout.n_local) // d
+        nodes = np.arange(*own) if order is None else order.places[slice(*own)]
+        return Displacement(self.w_array, self.low.array_w, self.s, None if z is None else z.array_w, nodes, d)
 
     def _couple(self) -> None:
         """G as a dense matrix of this rank alone, with vectors that share the arrays of r and w.
@@ -198,7 +195,8 @@ class TissueMidpoint:
         self.r.axpy(0.5, self.k)
 
     def _set_momentum(self, state: TissueState) -> None:
-        """Set r = s M v with no load pending. Collective."""
+        """Set r = s M v with no load pending, and low to zero. Collective."""
+        self.low.set(0.0)
         self.adopt(state)
         y = state.z.duplicate()
         self.system.M_ee.mult(state.v, y)
@@ -212,18 +210,18 @@ class TissueMidpoint:
 
     def _pull_back(self, z: PETSc.Vec) -> None:
         """Set k = -2 (K z - f), f the load of own terms. Collective."""
-        self.K2.mult(z, self.k)
+        self.K2.mult(z, self.k, *self._lows)
         if self.own is not None:
             self.k.array_w[:] += 2 * self.own
 
     def _gathered_z(self, state: TissueState) -> PETSc.Vec:
         """The rows here of a new state. Collective."""
-        if self.operators.whole:
+        if self.z is not None:
             self.z.array_w[:] = self.operators.gather(state.z.array_r)
         return self._held_z(state)
 
     def _held_z(self, state: TissueState) -> PETSc.Vec:
-        return self.z if self.operators.whole else state.z
+        return state.z if self.z is None else self.z
 
     def solve_midpoint(self, c: Array, feedback: Feedback | None = None) -> None:
         """Solve S w = h + G c, once a step. Collective.
@@ -248,9 +246,8 @@ class TissueMidpoint:
         return self.owned()
 
     def owned(self) -> Array:
-        """The owned rows of w, valid until the next call."""
-        self._pick()
-        return self.x_array
+        """The owned rows of w; a copy where all rows are here."""
+        return np.asarray(self.w_array[self.rows])
 
     def make_responses(self) -> Array:
         """Set Y = S^{-1} G for :meth:`accelerate`; its owned rows (n_local, n_s). Collective.
@@ -277,14 +274,11 @@ class TissueMidpoint:
 
     def advance(self, old: TissueState, new: TissueState) -> None:
         """Write z_{n+1}, v_{n+1} into ``new`` (may be ``old``) and carry k and r on. Collective."""
-        self._pick()
-        if new is old:
-            old.z.axpy(2.0, self.x)
-        else:
-            new.z.waxpy(2.0, self.x, old.z)
-            old.v.copy(new.v)
-        new.v.axpby(2 * self.s, -1.0, self.x)
-        self._propagate(self._move(new))
+        self.displacement.move(old.array, new.array)
+        z = self._held_z(new)
+        for vector in (z, new.z, new.v):  # else PETSc remembers their norms
+            vector.stateIncrease()
+        self._propagate(z)
         self.pending = self.c
 
     def pull(self) -> Array:
@@ -312,13 +306,8 @@ class TissueMidpoint:
         own = 0.0 if self.own is None else pulls[:, loads.shape[1]]
         return np.asarray(2 * ((loads * pulls[:, : loads.shape[1]]).sum(axis=1) + own))
 
-    def _move_whole(self, state: TissueState) -> PETSc.Vec:
-        """The rows here of a new z, by the operations that gave the state its rows: the same bits."""
-        self.z.axpy(2.0, self.w)
-        return self.z
-
     def _undamped(self, z: PETSc.Vec) -> None:
-        self.K2.multAdd(z, self.r, self.r)
+        self.K2.multAdd(z, self.r, self.r, *self._lows)
 
     def _undamped_loaded(self, z: PETSc.Vec) -> None:
         self._pull_back(z)
@@ -347,7 +336,7 @@ class TissueMidpoint:
     def energy(self, state: TissueState) -> float:
         """Energy (z' K z + v' M v) / 2 [J] of the state just reached, from the carried momentum. Collective."""
         self._pull_back(self._held_z(state))
-        n, k = len(self.x_array), self.k_array[self.rows] / -2
+        n, k = self.system.layout.n_local, self.k_array[self.rows] / -2
         z, v = state.array[:n], state.array[n:]
         h = self.r_array[self.rows] + self.G[self.rows] @ self.pending
         momentum = (h + k) / self.s
@@ -394,6 +383,6 @@ class TissueMidpoint:
         self.operators.destroy()
         for vector in self.spare:
             vector.destroy()
-        for name in ("r", "k", "x", "w", "r_here", "w_here", "added", "moved", "coupling", "k_old", "y", "z", "D"):
-            if hasattr(self, name):
+        for name in ("r", "k", "w", "r_here", "w_here", "low", "added", "moved", "coupling", "k_old", "y", "z", "D"):
+            if getattr(self, name, None) is not None:
                 getattr(self, name).destroy()

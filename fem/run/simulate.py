@@ -135,9 +135,9 @@ class Run(Stepped):
         if self.model.scene.time.start == "equilibrium":
             with self.model.watch.stage("equilibrium"):
                 self.state.z.array_w[:] = self._equilibrium()
+        self.midpoint.start(self.state)
         if self.contact is not None:
             self.contact.start(self.state, self.drive.q[0])
-        self.midpoint.start(self.state)
         self.record(0)
         self.ledger.start(self.state)
         self.watch_energy()
@@ -201,6 +201,7 @@ class Run(Stepped):
             legs=self.legs,
             beside=self.beside,
             state=self.state.array,
+            low=midpoint.operators.leave(midpoint.low.array_r),
             r=midpoint.operators.leave(midpoint.r.array_r),
             pending=midpoint.pending,
             hand_q=self.drive.q[: n + 1],
@@ -232,6 +233,7 @@ class Run(Stepped):
         self.name, self.beside = saved.run, saved.beside
         self.state = self.store.target(n)
         self.state.array[:] = saved.state
+        midpoint.low.array_w[:] = midpoint.operators.enter(saved.low)
         midpoint.r.array_w[:] = midpoint.operators.enter(saved.r)
         midpoint.pending = saved.pending
         self.drive.q[: n + 1], self.drive.v[: n + 1] = saved.hand_q, saved.hand_v

@@ -51,6 +51,12 @@ def address(array: Any) -> Any:
     return ctypes.c_void_p(array.__array_interface__["data"][0])
 
 
+def packed(*fields: int | Any | None) -> Any:
+    """A pointer to a struct of numbers (long) and arrays (pointers, None for 0) in C; the arrays must stay alive."""
+    numbers = [x if isinstance(x, int) else 0 if x is None else address(x).value for x in fields]
+    return ctypes.pointer((ctypes.c_longlong * len(fields))(*numbers))
+
+
 @dataclass(frozen=True)
 class Blocks:
     """Rows of a matrix in blocks of d x d; columns are numbers of nodes."""
@@ -89,12 +95,13 @@ class Differences:
         sums *= factor
         above.columns.__isub__(np.intc(begin))
         self._pairs = code.softgrasp_pairs
-        self._arguments = (d, nodes, *map(address, (above.first, above.columns, above.values, sums)))
+        self._fixed = packed(d, nodes, above.first, above.columns, above.values, sums)
         self.above, self.beside, self.sums = above, beside, sums
         # last vectors and where they begin, which a small step has no time to look up; it stays for their lives, as
         # nothing here calls placeArray
         self._z = self._y = like
         self._from = self._to = address(like.array_r)
+        self._low, self._rest = None, None
         self.ghosts: PETSc.Vec | None = None
         if like.comm.size > 1:
             self._ghosts(beside, d, nodes, code)
@@ -104,11 +111,11 @@ class Differences:
         others, columns = np.unique(beside.columns, return_inverse=True)
         columns = columns.astype(np.intc)
         places = PETSc.IS().createBlock(d, others.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
-        self.ghosts = PETSc.Vec().createSeq(d * len(others), comm=PETSc.COMM_SELF)
+        self.ghosts, self.behind = (PETSc.Vec().createSeq(d * len(others), comm=PETSc.COMM_SELF) for _ in range(2))
         self.scatter = PETSc.Scatter().create(self.like, places, self.ghosts, None)
         places.destroy()
         self._beside = code.softgrasp_beside
-        arrays = beside.first, columns, beside.values, self.ghosts.array_w
+        arrays = beside.first, columns, beside.values, self.ghosts.array_w, self.behind.array_w
         self._of_ghosts = (d, nodes, *map(address, arrays))
         self._kept = arrays  # addresses of which are in the arguments
 
@@ -122,23 +129,29 @@ class Differences:
         result.array_w[:] = self.diagonal
         return result
 
-    def mult(self, z: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Set y = factor K z. Collective."""
+    def mult(self, z: PETSc.Vec, y: PETSc.Vec, low: PETSc.Vec | None = None) -> None:
+        """Set y = factor K z, or factor K (z + low). Collective."""
         y.set(0.0)
-        self.multAdd(z, y, y)
+        self.multAdd(z, y, y, low)
 
-    def multAdd(self, z: PETSc.Vec, r: PETSc.Vec, y: PETSc.Vec) -> None:  # noqa: N802 - of PETSc
-        """Set y = r + factor K z. Collective."""
+    def multAdd(  # noqa: N802 - of PETSc
+        self, z: PETSc.Vec, r: PETSc.Vec, y: PETSc.Vec, low: PETSc.Vec | None = None
+    ) -> None:
+        """Set y = r + factor K z, or with z + low for a z that is rounded. Collective."""
         if y is not r:
             r.copy(y)
         if z is not self._z:
             self._z, self._from = z, address(z.array_r)
+        if low is not self._low:
+            self._low, self._rest = low, None if low is None else address(low.array_r)
         if y is not self._y:
             self._y, self._to = y, address(y.array_r)
         if self.ghosts is not None:
             self.scatter.scatter(z, self.ghosts)
-            self._beside(*self._of_ghosts, self._from, self._to)
-        self._pairs(*self._arguments, self._from, self._to)
+            if low is not None:
+                self.scatter.scatter(low, self.behind)
+            self._beside(*self._of_ghosts, self._from, self._rest, self._to)
+        self._pairs(self._fixed, self._from, self._rest, self._to)
         y.stateIncrease()
 
     @property
@@ -151,6 +164,7 @@ class Differences:
         self.like.destroy()
         if self.ghosts is not None:
             self.ghosts.destroy()
+            self.behind.destroy()
             self.scatter.destroy()
 
 

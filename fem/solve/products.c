@@ -1,6 +1,9 @@
-/* Products with K whose terms cancel: by the differences of neighbours, and in long double. Blocks of d x d, row by
-   row; see fem/solve/differences.py and fem/run/energy.py. The product of fem/solve/smoother.py. */
+/* Sums that keep their digits. Products with K whose terms cancel: by the differences of neighbours, and in long double.
+   Blocks of d x d, row by row; see fem/solve/differences.py and fem/run/energy.py. The displacement of a run: see
+   fem/run/displacement.py. The product of fem/solve/smoother.py. */
 #include <stddef.h>
+
+#include "sum.h"
 
 typedef float four_singles __attribute__((vector_size(16), aligned(4)));
 typedef double four __attribute__((vector_size(32)));
@@ -8,18 +11,20 @@ typedef double four __attribute__((vector_size(32)));
 
 #define INLINE static inline __attribute__((always_inline)) /* so that d is a constant in all loops */
 
-/* y += K z for K = K': blocks of the nodes above the diagonal alone, and the sums R of the block rows. */
-INLINE void pairs_as(const int d, int nodes, const int *first, const int *col, const double *K, const double *R,
-                     const double *restrict z, double *restrict y) {
+/* y += K (z + low) for K = K': blocks of the nodes above the diagonal alone, and the sums R of the block rows. */
+INLINE void pairs_as(const int d, const int two, int nodes, const int *first, const int *col, const double *K,
+                     const double *R, const double *restrict z, const double *restrict low, double *restrict y) {
   for (int i = 0; i < nodes; i++, R += d * d) {
-    double x[3], u[3], sum[3] = {0, 0, 0};
+    double x[3], l[3], u[3], sum[3] = {0, 0, 0};
     for (int a = 0; a < d; a++) x[a] = z[(size_t)i * d + a];
+    for (int a = 0; a < d; a++) l[a] = two ? low[(size_t)i * d + a] : 0;
     for (int a = 0; a < d; a++)
-      for (int b = 0; b < d; b++) sum[a] += R[a * d + b] * x[b];
+      for (int b = 0; b < d; b++) sum[a] += R[a * d + b] * (two ? x[b] + l[b] : x[b]);
     for (int e = first[i]; e < first[i + 1]; e++, K += d * d) {
-      const double *from = z + (size_t)col[e] * d;
-      double *to = y + (size_t)col[e] * d, back[3] = {0, 0, 0};
-      for (int a = 0; a < d; a++) u[a] = from[a] - x[a];
+      const size_t j = (size_t)col[e] * d;
+      double *to = y + j, back[3] = {0, 0, 0};
+      for (int a = 0; a < d; a++) u[a] = z[j + a] - x[a];
+      for (int a = 0; two && a < d; a++) u[a] += low[j + a] - l[a];
       for (int a = 0; a < d; a++)
         for (int b = 0; b < d; b++) sum[a] += K[a * d + b] * u[b];
       for (int a = 0; a < d; a++)
@@ -30,14 +35,19 @@ INLINE void pairs_as(const int d, int nodes, const int *first, const int *col, c
   }
 }
 
-/* y += the part of K z that comes from nodes of other ranks, whose displacements are in `ghost`. */
+/* y += the part of K (z + low) that comes from nodes of other ranks, which have `ghost` and `behind`. */
 INLINE void beside_as(const int d, int nodes, const int *first, const int *col, const double *K,
-                      const double *restrict ghost, const double *restrict z, double *restrict y) {
+                      const double *restrict ghost, const double *restrict behind, const double *restrict z,
+                      const double *restrict low, double *restrict y) {
   for (int i = 0; i < nodes; i++)
-    for (int e = first[i]; e < first[i + 1]; e++, K += d * d)
-      for (int a = 0; a < d; a++)
-        for (int b = 0; b < d; b++)
-          y[(size_t)i * d + a] += K[a * d + b] * (ghost[(size_t)col[e] * d + b] - z[(size_t)i * d + b]);
+    for (int e = first[i]; e < first[i + 1]; e++, K += d * d) {
+      const size_t here = (size_t)i * d, there = (size_t)col[e] * d;
+      for (int b = 0; b < d; b++) {
+        double u = ghost[there + b] - z[here + b];
+        if (low) u += behind[there + b] - low[here + b];
+        for (int a = 0; a < d; a++) y[here + a] += K[a * d + b] * u;
+      }
+    }
 }
 
 #define OF_BOTH(name, ...) (d == 2 ? name(2, __VA_ARGS__) : name(3, __VA_ARGS__))
@@ -79,14 +89,25 @@ INLINE void stars_as(const int d, int groups, const int *sizes, const int *node,
   }
 }
 
-void softgrasp_pairs(int d, int nodes, const int *first, const int *col, const double *K, const double *R,
-                     const double *z, double *y) {
-  OF_BOTH(pairs_as, nodes, first, col, K, R, z, y);
+/* What stays in a run, as a call takes as long as some of its arguments. */
+typedef struct {
+  long d, nodes;
+  const int *first, *col;
+  const double *K, *R;
+} Pairs;
+
+/* `low` may be 0, here and below. */
+void softgrasp_pairs(const Pairs *of, const double *z, const double *low, double *y) {
+  const long d = of->d;
+  if (low)
+    OF_BOTH(pairs_as, 1, of->nodes, of->first, of->col, of->K, of->R, z, low, y);
+  else
+    OF_BOTH(pairs_as, 0, of->nodes, of->first, of->col, of->K, of->R, z, z, y);
 }
 
 void softgrasp_beside(int d, int nodes, const int *first, const int *col, const double *K, const double *ghost,
-                      const double *z, double *y) {
-  OF_BOTH(beside_as, nodes, first, col, K, ghost, z, y);
+                      const double *behind, const double *z, const double *low, double *y) {
+  OF_BOTH(beside_as, nodes, first, col, K, ghost, behind, z, low, y);
 }
 
 void softgrasp_stars(int d, int groups, const int *sizes, const int *node, const float *W, int own, const double *x,
@@ -111,4 +132,39 @@ void softgrasp_wide(int rows, const int *first, const int *col, const double *A,
     for (int e = first[i]; e < first[i + 1]; e++) sum += (long double)A[e] * x[col[e]];
     y[i] = sum;
   }
+}
+
+INLINE void move_as(const int d, int rows, int count, const long *nodes, double *z, const double *w, double *low,
+                    double s, const double *old, double *new) {
+  const size_t n = (size_t)count * d;
+  if (!nodes) {
+#pragma GCC ivdep
+    for (size_t i = 0; i < n; i++) {
+      new[i] = exact_sum(old[i], 2 * w[i] + low[i], low + i);
+      new[n + i] = 2 * s * w[i] - old[n + i];
+    }
+    return;
+  }
+#pragma GCC ivdep
+  for (int i = 0; i < rows; i++) z[i] = exact_sum(z[i], 2 * w[i] + low[i], low + i);
+#pragma GCC ivdep
+  for (int i = 0; i < count; i++)
+    for (int a = 0; a < d; a++) {
+      new[(size_t)i * d + a] = z[nodes[i] * d + a];
+      new[n + (size_t)i * d + a] = 2 * s * w[nodes[i] * d + a] - old[n + (size_t)i * d + a];
+    }
+}
+
+typedef struct {
+  long d, rows, count;
+  const long *nodes;
+  double *z;
+  const double *w;
+  double *low;
+} Step;
+
+/* [z; v] of `count` nodes at the end of a step, whose rows are those here, or are `nodes` of all rows z. */
+void softgrasp_move(const Step *of, double s, const double *old, double *new) {
+  const long d = of->d;
+  OF_BOTH(move_as, of->rows, of->count, of->nodes, of->z, of->w, of->low, s, old, new);
 }

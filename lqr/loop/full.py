@@ -256,9 +256,9 @@ class LoopRun(Stepped):
         self.paid, self.paid_until = 0.0, 0
         self.midpoint.dissipated = 0.0
         self.contact: Contact | None = getattr(drive, "contact", None)
+        self.midpoint.start(self.state)
         if self.contact is not None:
             self.contact.start(self.state, drive.q[0])
-        self.midpoint.start(self.state)
         # two microseconds a step
         self.ledger = Ledger(self.midpoint, np.zeros((steps, problem.layout.n_s)), self.contact)
         self.ledger.start(self.state)

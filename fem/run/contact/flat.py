@@ -113,7 +113,7 @@ class FlatContact(Contact):
         self.point(
             X=self.surface.X, T=np.ascontiguousarray(self.surface.T), along=self.along, at=at, rows=rows,
             modes=np.ascontiguousarray(self.surface.T.T), places=np.zeros(size),
-            w=m.w_array, r=m.r_array, z=self.z, moved=self.moved, v=self.v, q=self.q,
+            w=m.w_array, r=m.r_array, z=self.z, low=self.low, moved=self.moved, v=self.v, q=self.q,
             slide=self.slide, level=self.level, rate=self.rate, gap=self.gaps, after=self.after,
             entered=self.entered, least=self.least, force=table.force, impulse=table.impulse, touching=table.touching,
             hand=table.hand, kick=table.kick, gaps=table.gap, energy=table.energy,
@@ -286,7 +286,7 @@ class FlatContact(Contact):
 
     def _carry_between(self, state: TissueState) -> None:
         """Carry the points on to the bits that a restart finds, and r with them. Collective."""
-        self.z[:], self.moved[:] = self.surface.gather(state.z.array_r), 0.0
+        self.z[:], self.low[:], self.moved[:] = self.surface.gather(state.z.array_r), 0.0, 0.0
         self.c.softgrasp_look(self.f)
         self.gaps[:], self.table.gap[self.n + 1] = self.after, self.least
         if self.f.pressed:

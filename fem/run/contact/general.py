@@ -34,6 +34,7 @@ from softgrasp.fem.petsc import Array, rows_on_all
 from softgrasp.fem.run.contact.record import ContactRecord, Tables
 from softgrasp.fem.run.contact.rows import Flags, Ints, Rows
 from softgrasp.fem.run.contact.strike import Strike
+from softgrasp.fem.run.displacement import exact_sum
 from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import Driven
@@ -88,7 +89,7 @@ class Contact:
         held = rows_on_all(self.layout.comm, self.layout.held)
         self.held, self.held_T = held, rigid_modes(held, self.d, model.scene.effects.rotation, self.layout.reference)
         self.small = self.make_problem()
-        self.z, self.moved, self.forces = (np.zeros(self.p * self.d) for _ in range(3))
+        self.z, self.low, self.moved, self.forces = (np.zeros(self.p * self.d) for _ in range(4))
         self.gaps = self.after = np.zeros((len(self.obstacles), self.p))
         self.fastest = 0.0  # largest velocity of a boundary node in a step with contact [m/s]
         self.drive: Driven | None = None
@@ -138,8 +139,7 @@ class Contact:
 
     def _make_rows(self, pairs: Ints) -> Rows:
         """Rows of pairs of obstacle and node, (k, 2), without force."""
-        k = len(pairs)
-        return Rows(pairs[:, 0], pairs[:, 1], np.zeros((k, self.d)), np.zeros(k))
+        return Rows(pairs[:, 0], pairs[:, 1], np.zeros((len(pairs), self.d)), np.zeros(len(pairs)))
 
     # ---- the run
 
@@ -148,7 +148,9 @@ class Contact:
 
         Raises SceneError: an obstacle is in the tissue at the start.
         """
-        self.z = np.array(self.surface.gather(state.z.array_r))
+        self.z, midpoint = np.array(self.surface.gather(state.z.array_r)), self.midpoint
+        if self.surface.B is None:  # else z comes from the nodes in every step
+            self.low[:] = self.surface.gather(midpoint.low.array_r[midpoint.operators.rows])
         x = self.surface.places(q, self.z)
         self.gaps = self._gaps(x, n)
         self.table.gap[n] = self.gaps.min(axis=1)
@@ -171,7 +173,7 @@ class Contact:
         """
         self.n, self.drive = n, drive
         self.moved = self._take(self.midpoint.w_array)
-        x1 = self.surface.places(drive.q[n + 1], self.z + 2 * self.moved)
+        x1 = self.surface.places(drive.q[n + 1], self.z + (2 * self.moved + self.low))
         self.after = self._gaps(x1, n + 1)
         x0 = self.surface.places(drive.q[n], self.z)
         check_passage(self.obstacles, self.gaps, self.after, (x0, x1), (n * self.dt, (n + 1) * self.dt))
@@ -287,10 +289,11 @@ class Contact:
     def finish(self, state: TissueState) -> None:
         """Carry on what the step has left in the midpoint, and stop what is pressed. Collective."""
         n = self.n
-        self.z += 2 * self.moved
         self.gaps = self.after
         if self.surface.B is not None:
             self.z = self.surface.gather(state.z.array_r)
+        else:
+            self.z, self.low = exact_sum(self.z, 2 * self.moved + self.low)
         if len(self.rows.node) or self.surface.B is not None:
             assert self.drive is not None
             self.gaps = self._gaps(self.surface.places(self.drive.q[n + 1], self.z), n + 1)  # the bits of a restart
@@ -329,8 +332,7 @@ class Contact:
 
     def pressing(self) -> Array:
         """Force of the obstacles on each boundary node in the last step, without impulses, (p, d) [N]."""
-        forces = self.forces if len(self.rows.node) else np.zeros_like(self.forces)
-        return forces.reshape(self.p, self.d)
+        return (self.forces if len(self.rows.node) else np.zeros_like(self.forces)).reshape(self.p, self.d)
 
     def check_hand(self, q: Array, begin: int, end: int) -> None:
         """See that the nodes that follow the hand are in no obstacle at the steps from begin to before end.
@@ -358,10 +360,9 @@ class Contact:
     def record(self) -> ContactRecord:
         """The record of the run."""
         table, (work, touch, stopped, rubbed) = self.table, self.table.energies.tolist()
-        names = tuple(o.name for o in self.obstacles)
         return ContactRecord(
-            names, table.force, table.impulse, table.gap, table.touching, work, touch, stopped, rubbed,
-            self.small.rounds, self.responses.count, self.p,
+            tuple(o.name for o in self.obstacles), table.force, table.impulse, table.gap, table.touching, work, touch,
+            stopped, rubbed, self.small.rounds, self.responses.count, self.p,
         )  # fmt: skip
 
     def restart_arrays(self) -> dict[str, Array]:

@@ -4,7 +4,7 @@ With rho = r - S w and e = pi - M v, which rounding makes, e_1 = a rho / s - e_0
 alternates and cancels; where an obstacle stops nodes, and while stiff modes ring behind that, it stays. There the
 momentum becomes that of v, and a factor gives back the energy that this and the residual take,
 
-    pi <- (1 + c) M v,   c v'M v = a w'rho - v_1'e_0,   w = (z_1 - z_0) / 2,   v_1 = 2 s w - v_0 before the impulse.
+    pi <- (1 + c) M v,   c v'M v = a w'rho - v_1'e_0,   v_1 = 2 s w - v_0 before the impulse.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from softgrasp.fem.material import LayerMaterial, of_layers
 from softgrasp.fem.petsc import Array, rows_on_all
 from softgrasp.fem.run.contact.record import Tables
-from softgrasp.fem.run.energy import wide_product
+from softgrasp.fem.run.energy import wide_product, wide_pull
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 
 RISE = 1 / 8  # nodes that land in a step over those that are pressed then, from which it counts as a landing [1]
@@ -50,27 +50,26 @@ class Landings:
 class Landing:
     """Such a step, as it was before its end."""
 
-    z: Array  # displacement at its start, on the owned rows, (n_local,) [m]
-    v: Array  # velocity at its start, the same, (n_local,) [m/s]
+    v: Array  # velocity at its start, on the owned rows, (n_local,) [m/s]
     r: Array  # right-hand side of its solve, on the owned rows, (n_local,) [N]
 
     @staticmethod
     def of(midpoint: TissueMidpoint, old: TissueState) -> Landing:
         """Keep what the end of the step overwrites."""
-        return Landing(old.z.array_r.copy(), old.v.array_r.copy(), midpoint.r_array[midpoint.operators.rows].copy())
+        return Landing(old.v.array_r.copy(), midpoint.r_array[midpoint.operators.rows].copy())
 
     def finish(self, midpoint: TissueMidpoint, new: TissueState) -> None:
         """Set the momentum to that of v. Collective."""
         system, s = midpoint.system, np.longdouble(midpoint.s)
         comm, n = system.layout.comm, system.layout.n_local
-        w, v = (new.array[:n].astype(np.longdouble) - self.z) / 2, new.array[n:]
-        moved, speed, z = (rows_on_all(comm, x) for x in (w.astype(float), v, new.array[:n]))
+        w, v = midpoint.owned(), new.array[n:]
+        moved, speed = (rows_on_all(comm, x) for x in (w, v))
         K, M = system.K_ee, system.M_ee
         rho = self.r - (1 + s * midpoint.beta) * wide_product(K, moved)
         rho -= s * (s + midpoint.alpha) * wide_product(M, moved)
         h = midpoint.r_array[midpoint.operators.rows] + system.G.astype(np.longdouble) @ midpoint.pending
         momentum, held = wide_product(M, speed), 0.0 if system.own_load is None else system.own_load
-        late = (h + wide_product(K, z) - held) / s - momentum
+        late = (h + wide_pull(midpoint, new)[1] - held) / s - momentum
         early = midpoint.a / s * rho - late
         given = midpoint.a * (w @ rho) - (2 * s * w - self.v) @ early
         work, twice = (float(comm.allreduce(x)) for x in (given, v @ momentum))

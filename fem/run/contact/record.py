@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.displacement import exact_sum
 from softgrasp.fem.shown import Shown
 
 
@@ -77,14 +78,12 @@ class Tables:
         return Tables(force, impulse, gap, touching, hand, kick, np.zeros(4), np.zeros((2, 4)))
 
     def add(self) -> None:
-        """Add the energies of a step to the sums, by the sum of [Knuth97] that keeps what rounding loses."""
+        """Add the energies of a step to the sums, and keep what rounding loses."""
         if not self.energy.any():
             return
-        before, more = self.sums[0].copy(), self.energy
-        self.sums[0] += more
-        share = self.sums[0] - before
-        self.sums[1] += (before - (self.sums[0] - share)) + (more - share)
-        more[:] = 0.0
+        self.sums[0], lost = exact_sum(self.sums[0], self.energy)
+        self.sums[1] += lost
+        self.energy[:] = 0.0
 
     @property
     def energies(self) -> Array:

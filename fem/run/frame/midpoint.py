@@ -113,7 +113,8 @@ class TurningStep(FiniteStrainMidpoint):
     # ---- the state
 
     def _set_momentum(self, state: TissueState) -> None:
-        """Set r = s M y. Collective."""
+        """Set r = s M y, and low to zero. Collective."""
+        self.low.set(0.0)
         self.adopt(state)
         y, x = state.z.duplicate(), state.z.duplicate()
         x.array_w[:] = self._lifted(state)

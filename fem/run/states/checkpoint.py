@@ -26,7 +26,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.shown import counted
 
-FORMAT = 7
+FORMAT = 8
 FRICTION = 5  # form of the sets of friction in them
 CONTACT = 4  # form of what contact carries on
 ITERATIONS = 2  # form of the iterations of steps at finite strain or in a frame
@@ -45,6 +45,7 @@ class RestartState:
     legs: list[int]  # numbers of the steps at which the run was started and resumed
     beside: dict[str, str]  # SHA-256 of each further file of the folder by its name; rank 0's is written
     state: Array  # state [z; v_z] of this rank's nodes, (2 n_local,) [m; m/s]
+    low: Array  # what z lacks of the sum of its steps, like r [m], see `softgrasp.fem.run.displacement`
     r: Array  # right-hand side of the next step, (n_local,) [N]
     pending: Array  # coefficients of the load that ``r`` lacks, (n_s,)
     hand_q: Array  # displacement of the hand so far, (n + 1, n_s) [m, rad]
