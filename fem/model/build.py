@@ -351,8 +351,7 @@ def build(
 
             mesh = refined_mesh(comm, scene)
         mesh = mesh or make_mesh(comm, scene)
-    d = mesh.dimension
-    check_dimension(scene, d)  # of a mesh file it was unknown before
+    check_dimension(scene, d := mesh.dimension)  # of a mesh file it was unknown before
     if scene.motion.csv is not None:
         with raise_on_all_ranks(comm):  # here, so that a wrong file ends nothing that takes long
             read_motion(scene, d + scene.effects.rotation * d * (d - 1) // 2)

@@ -31,7 +31,7 @@ double softgrasp_look(const Flat *f) {
       double g = -f->level[o];
       for (int a = 0; a < d; a++) g += n[a] * x[i * d + a];
       to[i] = g;
-      if (!(g >= least)) least = g; /* so that what is no number is the least */
+      if (!isnan(least) && !(g >= least)) least = g; /* so that what is no number is the least */
     }
     f->least[o] = least;
   }

@@ -357,3 +357,17 @@ def test_a_start_inside_and_a_hand_that_meets_an_obstacle_are_refused() -> None:
     held = np.concatenate(MPI.COMM_WORLD.allgather(model.system.layout.held))[0].tolist()
     with pytest.raises(SoftgraspError, match="the hand meets obstacle 'disc1' at t = 0 s"):
         run(f"obstacle=[{{kind='disc', center={held}, radius=0.01}}]")
+
+
+@pytest.mark.serial
+@pytest.mark.skipif(contact_library() is None, reason="no C compiler")
+def test_a_gap_that_is_no_number_is_the_least() -> None:
+    """Also where gaps of later nodes are numbers."""
+    one = Run(build("set_down", ["tissue.cells=[4, 4]", "time.steps=4"]), RunOptions())
+    one.start()
+    contact: Any = one.contact
+    contact.moved[0] = np.nan
+    contact.f.whole = False
+    contact.c.softgrasp_look(contact.f)
+    one.midpoint.destroy()
+    assert np.isnan(contact.least).all()
