@@ -130,7 +130,7 @@ class TissueMidpoint:
         self.own: Array | None = None if own is None else np.asarray(self.operators.gather(own))
         self.z: PETSc.Vec | None = self.w.duplicate() if self.operators.whole else None
         self.low = self.w.duplicate()
-        self.low.set(0.0)
+        self.low.array_w[:] = 0.0
         # K (z + low) needs compiled code
         self._lows = (self.low,) if isinstance(self.K2, Differences) else ()
         self.displacement = self._make_displacement()
@@ -196,7 +196,7 @@ class TissueMidpoint:
 
     def _set_momentum(self, state: TissueState) -> None:
         """Set r = s M v with no load pending, and low to zero. Collective."""
-        self.low.set(0.0)
+        self.low.array_w[:] = 0.0  # PETSc does not see that C code writes into it
         self.adopt(state)
         y = state.z.duplicate()
         self.system.M_ee.mult(state.v, y)

@@ -114,7 +114,7 @@ class TurningStep(FiniteStrainMidpoint):
 
     def _set_momentum(self, state: TissueState) -> None:
         """Set r = s M y, and low to zero. Collective."""
-        self.low.set(0.0)
+        self.low.array_w[:] = 0.0  # PETSc does not see that C code writes into it
         self.adopt(state)
         y, x = state.z.duplicate(), state.z.duplicate()
         x.array_w[:] = self._lifted(state)
