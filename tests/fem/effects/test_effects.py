@@ -84,9 +84,9 @@ def work_of_a_run(model: Model) -> dict[str, int]:
     before = [event.getPerfInfo()["count"] for event in events]
     products, add = [0], Differences.multAdd
 
-    def counted(self: Differences, z: PETSc.Vec, r: PETSc.Vec, y: PETSc.Vec) -> None:
+    def counted(self: Differences, *vectors: PETSc.Vec | None) -> None:
         products[0] += 1
-        add(self, z, r, y)
+        add(self, *vectors)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Differences, "multAdd", counted)
