@@ -36,6 +36,7 @@ class Certificates:
     def of(self, gains: Sequence[Gain]) -> list[Abscissa | SolverError]:
         """The certificate of each gain, or why no eigenvalue converges. Collective."""
         if not self._divided(len(gains)):
+            self._shift = self.comm.bcast(self._shift)  # ranks that certified gains by themselves have their own
             return [self._found(self.problem, gain, self._modes) for gain in gains]
         every = [self._whole_gain(gain) for gain in gains]
         plant, modes, best = self._whole

@@ -56,6 +56,24 @@ def test_each_rank_certifies_some_gains(comm: MPI.Intracomm, changes: Any, monke
         assert abs(one.value - all_.value) < 1e-8 * max(1.0, abs(all_.value))  # tolerance 1e-9 of poles of size 10
 
 
+@pytest.mark.ranks
+def test_a_gain_that_all_ranks_certify_has_one_shift(comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = make_problem(build(make_scene(CONTROL, KELVIN), comm=comm))
+    K = modal_start(Plant(problem)).gain.times(-np.linalg.inv(np.linalg.cholesky(problem.R)))
+    gains = [Gain.of_block(K.times(np.eye(2) * scale)) for scale in (1.0, 0.8)]  # none for the third rank
+    certificates = Certificates(problem, gains[0])
+    certificates.of(gains)
+
+    def together(plant: Any, gain: Gain, modes: Any, shift: float | None) -> Abscissa:
+        assert comm.allgather(shift) == [shift] * comm.size
+        return abscissa(plant, gain, modes, shift)
+
+    monkeypatch.setattr(divided, "abscissa", together)
+    monkeypatch.setattr(divided, "factor_on_every_rank", lambda *_, **__: False)
+    (last,) = certificates.of(gains[1:])
+    assert isinstance(last, Abscissa)
+
+
 @pytest.mark.ranks(2)
 def test_a_gain_without_a_spectrum_leaves_no_rank_waiting(comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = make_problem(build(make_scene(CONTROL, KELVIN), comm=comm))
@@ -63,7 +81,7 @@ def test_a_gain_without_a_spectrum_leaves_no_rank_waiting(comm: MPI.Intracomm, m
     gains = [Gain.of_block(K), Gain.of_block(K.times(np.eye(2) * 0.5))]
 
     def fails(plant: Any, gain: Gain, *arguments: Any) -> Abscissa:
-        if comm.rank == 1:
+        if np.array_equal(gain.K_s, gains[1].K_s):
             raise SolverError("none converges")
         return abscissa(plant, gain, *arguments)
 
