@@ -89,7 +89,7 @@ class BlockSystem(Shown):
     gravity: Array | None = None  # free fall in the hand's degrees of freedom, (n_s,) [m/s^2], or None
     hand_weight: bool = False  # whether gravity acts on the hand's own mass too
     two_way: bool = False  # whether the tissue acts on the hand
-    memory: float | None = None  # that a run may use on each node, `output.memory` [byte]; None: what is free
+    memory: float = np.inf  # that a solver may need to be chosen [byte]
     graded: bool = False  # whether cell sizes vary so much that Euclidean norms of node values mean little
     points: QuadraturePoints | None = None  # quadrature points of the finite-strain law; None: linear, force K_ee z
     energy: LayerEnergy | None = None  # own energy of the tissue; None: a built-in law

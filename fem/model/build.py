@@ -33,7 +33,7 @@ from softgrasp.fem.model.assembly import (
     make_points,
 )
 from softgrasp.fem.model.contact import rigid_modes
-from softgrasp.fem.model.memory import box_simplices, check_memory, free_bytes
+from softgrasp.fem.model.memory import box_simplices, check_memory, solver_memory
 from softgrasp.fem.model.outputs import Output, make_outputs, output_columns
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective
@@ -390,7 +390,7 @@ def build(
             gravity=acceleration(scene, layout.n_s),
             hand_weight=bool(scene.effects.gravity is not None and scene.effects.gravity.hand_weight),
             two_way=scene.effects.reaction,
-            memory=None if scene.output.memory == "auto" else free_bytes(scene),
+            memory=solver_memory(scene, layout.n_e, layout.dimension),
             graded=scene.tissue.refine is not None and scene.tissue.refine.grading != "off",
             points=points,
             energy=energy,

@@ -57,16 +57,13 @@ def box_simplices(cells: list[int]) -> int:
     return math.factorial(len(cells)) * math.prod(cells)
 
 
-def need(scene: Scene, dimension: int, cells: int, ranks: int, free: float, run: bool) -> Need:
-    """Estimate the memory of a model of ``cells`` triangles or tetrahedra and, if it will ``run``, of its steps.
-
-    ``free``: memory that the solver may use over all ranks [byte].
-    """
+def need(scene: Scene, dimension: int, cells: int, ranks: int, run: bool) -> Need:
+    """Estimate the memory of a model of ``cells`` triangles or tetrahedra and, if it will ``run``, of its steps."""
     kind, d = (dimension, scene.tissue.order), dimension
-    n_e = max(int(kind[1] ** d / math.factorial(d) * cells * d), 1)  # p^d / d! nodes a cell in large regular meshes
+    n_e = max(int(_nodes(*kind) * cells * d), 1)
     n_s = d + (d * (d - 1) // 2 if scene.effects.rotation else 0)
     work = steps_of(scene, n_e, d, ranks)
-    name = work.solver(scene.time.solver, free)
+    name = work.solver(scene.time.solver, solver_memory(scene, n_e, d))
     copies = work.copies(name)
     outputs = sum(n_s if o.kind == "hand" else d for o in scene.control.outputs) if scene.control is not None else d
     # times; q, v, a, c, pulls and temporaries of the hand's table; outputs, their sum and their rigid share: measured
@@ -83,15 +80,15 @@ def need(scene: Scene, dimension: int, cells: int, ranks: int, free: float, run:
 
 
 def solver_of(scene: Scene, layout: BlockLayout) -> tuple[SolverName, str]:
-    """The solver of the steps of a scene, with the reason in words. Collective."""
-    free = layout.comm.allreduce(free_bytes(scene), MPI.MIN)
-    return chosen(scene, steps_of(scene, layout.n_e, layout.dimension, layout.comm.size), free)
+    """The solver of the steps of a scene, with the reason in words."""
+    return chosen(scene, steps_of(scene, layout.n_e, layout.dimension, layout.comm.size))
 
 
-def chosen(scene: Scene, work: Work, free: float) -> tuple[SolverName, str]:
-    """The solver of steps that do so much work, with ``free`` bytes of memory, and the reason in words."""
-    name = work.solver(scene.time.solver, free)
-    return name, work.reason(scene.time.solver, free) + work.price_of_bits(name)
+def chosen(scene: Scene, work: Work) -> tuple[SolverName, str]:
+    """The solver of steps that do so much work, and the reason in words."""
+    requested, limit = scene.time.solver, solver_memory(scene, work.n, work.dimension)
+    name = work.solver(requested, limit)
+    return name, work.reason(requested, limit) + work.price_of_bits(name)
 
 
 def steps_of(scene: Scene, n: int, dimension: int, ranks: int) -> Work:
@@ -107,6 +104,22 @@ def steps_of(scene: Scene, n: int, dimension: int, ranks: int) -> Work:
     return Work(n, dimension, order, ranks, time.steps, False, contrast, bits, graded, damped, linear)
 
 
+def solver_memory(scene: Scene, n: float, dimension: int) -> float:
+    """Memory that a solver may need to be chosen [byte]: what mesh and matrices leave of ``output.memory``, or any.
+
+    With "auto" no machine's memory decides: what does not fit there is refused. No candidate needs over 6 GB on a rank.
+    """
+    if scene.output.memory == "auto":
+        return np.inf
+    order = scene.tissue.order
+    return scene.output.memory * GIB - CELL_BYTES[dimension, order] * n / dimension / _nodes(dimension, order)
+
+
+def _nodes(dimension: int, order: int) -> float:
+    """Nodes a cell of large regular meshes, p^d / d! [1]."""
+    return float(order**dimension) / math.factorial(dimension)
+
+
 def free_bytes(scene: Scene) -> float:
     """Memory that a run may use on this node [byte]: ``output.memory``, or what is free."""
     return free_memory() if scene.output.memory == "auto" else scene.output.memory * GIB
@@ -120,8 +133,7 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
     node = comm.Split_type(MPI.COMM_TYPE_SHARED)
     ranks, free = node.size, node.bcast(free_bytes(scene))
     node.Free()
-    least = comm.allreduce(free, MPI.MIN)
-    estimate = need(scene, dimension, cells, comm.size, least, run)
+    estimate = need(scene, dimension, cells, comm.size, run)
     nodes = comm.allgather((estimate.of(ranks / comm.size, ranks) / max(free, 1.0), ranks, free))
     worst, ranks, free = max(nodes)
     if worst <= 1:
@@ -135,6 +147,10 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
     else:
         given, key = _size_key(scene)
         fits = _fitting(scene, comm.size, run, dimension, cells, share, ranks, free)
+        allowed = float(f"{0.95 * free / GIB:.2g}")
+        other = scene.model_copy(update={"output": scene.output.model_copy(update={"memory": allowed})})
+        if need(other, dimension, cells, comm.size, run).of(share, ranks) <= allowed * GIB:
+            fits = f"another solver by --set output.memory={allowed:g}, {fits}"
         parts = f"mesh and matrices {size_text(share * estimate.mesh)}"
         if estimate.factor:  # conjugate gradients have none
             parts += f", factor {size_text(share * estimate.factor)}"
@@ -159,7 +175,7 @@ def _fitting(
     for _ in range(60):
         middle = (low + high) / 2
         count = box_simplices(smaller(middle)) if box else smaller(middle)[0]
-        fits = need(scene, dimension, count, size, free, run).of(share, ranks) <= free
+        fits = need(scene, dimension, count, size, run).of(share, ranks) <= free
         low, high = (middle, high) if fits else (low, middle)
     return f"tissue.cells = {smaller(low)}" if box else f"{smaller(low)[0]} of its {cells} cells"
 

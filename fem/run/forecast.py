@@ -9,12 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-import psutil
-from mpi4py import MPI
-
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.memory import factor_bytes, free_bytes, need, steps_of
+from softgrasp.fem.model.memory import factor_bytes, need, solver_memory, steps_of
 from softgrasp.fem.resources import size_text
 from softgrasp.fem.run.states.frames import frame_count
 from softgrasp.fem.scene.scene import Scene
@@ -61,7 +57,6 @@ def forecast(
     d: int,
     cells: int,
     ranks: int,
-    free: float = np.inf,
     touching: ExpectedContact | None = None,
 ) -> Forecast:
     """Modelled time and memory of a linear run on so many ranks.
@@ -70,16 +65,16 @@ def forecast(
         n: unknowns of the tissue.
         d: dimension.
         cells: triangles or tetrahedra.
-        free: memory that the solver may use over all ranks [byte].
         touching: contact with obstacles, or None.
     """
     kind, work, share = (d, scene.tissue.order), steps_of(scene, n, d, ranks), seams(n, d, ranks)
-    name, requested = work.solver(scene.time.solver, free), scene.time.solver
+    requested, limit = scene.time.solver, solver_memory(scene, n, d)
+    name = work.solver(requested, limit)
     first = scene.time.start == "equilibrium" and scene.effects.gravity
     static = replace(work, solves=resting_solves(n, d), few=True)
-    resting = static.solver(requested, free)
+    resting = static.solver(requested, limit)
     frames = frame_count(scene, n) + 1 if scene.output.fields != "none" else 0
-    memory = need(scene, d, cells, ranks, free, run=True).of(1.0, ranks) + ranks * LIBRARIES
+    memory = need(scene, d, cells, ranks, run=True).of(1.0, ranks) + ranks * LIBRARIES
     if name in ITERATIVE:
         memory += work.memory(name)
     if first:  # both are there at once
@@ -103,9 +98,7 @@ def forecast(
 
 
 def forecasts(model: Model, n_e: int | None = None, cells: int | None = None) -> tuple[Forecast, ...]:
-    """Modelled time and memory of a run on its own number of ranks and on :data:`RANKS`, linear only. Collective.
-
-    Ranks beyond the cores of this node are on further nodes like it.
+    """Modelled time and memory of a run on its own number of ranks and on :data:`RANKS`, linear only.
 
     Args:
         n_e, cells: unknowns and cells of the run; None: those of the model.
@@ -113,17 +106,13 @@ def forecasts(model: Model, n_e: int | None = None, cells: int | None = None) ->
     scene, layout = model.scene, model.system.layout
     if model.system.points is not None or model.system.frame is not None:
         return ()
-    comm, cores = layout.comm, psutil.cpu_count(logical=False) or 1
-    free = comm.allreduce(free_bytes(scene), MPI.MIN)
     n, simplices = n_e or layout.n_e, cells or model.cells
-    counts, touching = sorted({*RANKS, comm.size}), None
+    counts, touching = sorted({*RANKS, layout.comm.size}), None
     if scene.effects.obstacles:  # only scenes with contact pay for it
         from softgrasp.fem.run.contact.expected import expected_contact
 
         touching = expected_contact(model, n)
-    return tuple(
-        forecast(scene, n, layout.dimension, simplices, ranks, free * -(-ranks // cores), touching) for ranks in counts
-    )
+    return tuple(forecast(scene, n, layout.dimension, simplices, ranks, touching) for ranks in counts)
 
 
 def told(results: Sequence[Forecast]) -> str:

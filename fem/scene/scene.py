@@ -164,7 +164,7 @@ class Output(Section):
         0, description="steps between restart files [1]; 0: only on interrupt"
     )
     memory: Literal["auto"] | Positive = Field(
-        "auto", description="memory that a run may use on each node [GiB]; auto: what is free when it starts"
+        "auto", description="memory that a run may use on each node [GiB]; auto: what is free, and any solver"
     )
 
 

@@ -7,10 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol, cast
 
-from mpi4py import MPI
-
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.resources import free_memory
 from softgrasp.fem.solve.costs import FEW_SOLVES, UNKNOWN
 from softgrasp.fem.solve.solvers import (
     ITERATIVE,
@@ -84,21 +81,11 @@ def resting_solves(n: int, dimension: int) -> int:
 
 
 def static_solver(system: BlockSystem, requested: str = "auto", solves: int = FEW_SOLVES) -> SolverName:
-    """The solver of the least modelled time for static solves with K_ee, or K_ee + s D_ee + s^2 M_ee. Collective.
-
-    A system has one for each number of solves, however much memory is left later, so that its factor is shared. With
-    ``output.memory`` in the scene no machine's free memory counts.
-    """
-    if requested != "auto":
-        return cast(SolverName, requested)
-    chosen = system.kept.setdefault("static solvers", {})
-    if solves not in chosen:
-        # tangents of finite strain may lose definiteness, which a factor reports
-        known = bool(system.materials) and system.points is None
-        work = work_of(system.layout, solves, True, system.contrast if known else UNKNOWN)
-        free = system.layout.comm.allreduce(system.memory or free_memory(), MPI.MIN)
-        chosen[solves] = replace(work, graded=system.graded).solver(memory=free)
-    return cast(SolverName, chosen[solves])
+    """The solver of the least modelled time for static solves with K_ee, or K_ee + s D_ee + s^2 M_ee."""
+    # tangents of finite strain may lose definiteness, which a factor reports
+    known = bool(system.materials) and system.points is None
+    work = work_of(system.layout, solves, True, system.contrast if known else UNKNOWN)
+    return replace(work, graded=system.graded).solver(requested, system.memory)
 
 
 @contextmanager

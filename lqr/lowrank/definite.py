@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from softgrasp.fem.petsc import Array, Complex
-from softgrasp.fem.resources import free_memory
 from softgrasp.fem.solve.solvers import TissueSolver, make_solver, work_of
 from softgrasp.fem.solve.stiffness import static_columns
 from softgrasp.fem.system import BlockSystem, dynamic_stiffness
@@ -55,7 +54,7 @@ class DefiniteTissue(ShiftedTissue):
         self.destroy()
         layout = self.system.layout
         work = work_of(layout, self.columns, True, self.system.contrast if self.system.materials else 1.0)
-        fitting = replace(work, few=False).choose(layout.comm.bcast(free_memory()))
+        fitting = replace(work, few=False).choose(self.system.memory)
         name = min(fitting, key=work.seconds)
         self.solver = make_solver(dynamic_stiffness(self.system, -p.real), name, layout, PREFIX, RESPONSE_RTOL)
         self.shift, self.package = p, self.solver.package

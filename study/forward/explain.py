@@ -32,7 +32,6 @@ from softgrasp.fem.model.memory import (
     check_memory,
     chosen,
     factor_bytes,
-    free_bytes,
     need,
     steps_of,
 )
@@ -217,10 +216,9 @@ def _explained(scene: Scene, looked: Model, sizes: ModelSizes, model: Model | No
 
     Collective. ``model``: that of the scene, None where it was not built.
     """
-    comm, d, ranks = looked.system.layout.comm, looked.system.layout.dimension, sizes.ranks
-    free = comm.allreduce(free_bytes(scene), MPI.MIN)
+    d, ranks = looked.system.layout.dimension, sizes.ranks
     work = steps_of(scene, sizes.n_e, d, ranks)
-    name, reason = chosen(scene, work, free)
+    name, reason = chosen(scene, work)
     copies = work.copies(name)
     small = looked.system
     if small.layout.n_e <= DIRECT_LIMIT[d]:  # beyond, modes take minutes
@@ -265,7 +263,7 @@ def _explained(scene: Scene, looked: Model, sizes: ModelSizes, model: Model | No
             *away,
         ),
         outputs=output_places(looked if model is None else model),
-        memory=need(scene, d, sizes.cells, ranks, free, run=True),
+        memory=need(scene, d, sizes.cells, ranks, run=True),
         forecasts=forecasts(looked, sizes.n_e, sizes.cells),
         snapshot_columns=columns,
         snapshot_bytes=16 * sizes.n_e * columns,

@@ -344,7 +344,7 @@ def test_multiple_modes_are_all_found(comm: MPI.Intracomm) -> None:
     nodes = np.arange(begin, end, dtype=float)[:, None]
     shape = {"n_e": 40, "n_local": end - begin, "dimension": 1, "order": 1}
     layout = SimpleNamespace(comm=comm, nodes=nodes, reference=np.zeros(1), **shape)
-    rest = {"kept": {}, "materials": (), "points": None, "graded": False, "memory": None}
+    rest = {"kept": {}, "materials": (), "points": None, "graded": False, "memory": np.inf}
     system: Any = SimpleNamespace(layout=layout, K_ee=K, M_ee=M, **rest)
     omega, Phi = lowest_modes(system, 4)
     np.testing.assert_allclose(omega, np.sqrt([1.0, 1.0, 1.0, 2.0]), rtol=1e-8)  # RESIDUAL of the check

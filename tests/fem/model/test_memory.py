@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,7 +13,7 @@ from softgrasp.fem import resources
 from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.model.build import build
-from softgrasp.fem.model.memory import box_simplices, check_memory, free_bytes, need
+from softgrasp.fem.model.memory import box_simplices, check_memory, chosen, free_bytes, need, steps_of
 from softgrasp.fem.strain.body import HyperelasticBody
 from tests.helpers.models import CUBE, make_scene
 
@@ -86,7 +88,7 @@ def test_cells_of_a_box_are_those_of_its_mesh(comm: MPI.Intracomm, table: dict[s
 
 @pytest.mark.ranks
 def test_shares_of_the_nodes_add_up(comm: MPI.Intracomm) -> None:
-    found = need(make_scene(), 2, 10**6, comm.size, float("inf"), run=True)
+    found = need(make_scene(), 2, 10**6, comm.size, run=True)
     assert found.of(1.0, comm.size) == found.mesh + found.factor + comm.size * found.tables
     assert found.of(0.5, 1) * 2 == pytest.approx(found.of(1.0, 2), rel=1e-12)  # two nodes, one rank each
 
@@ -104,6 +106,24 @@ def test_a_container_limits_what_is_free(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert free_bytes(make_scene(output={"memory": 2.0})) == 2 * GIB
 
 
+def test_no_machine_decides_which_solver_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a factor does not fit in what is free the run is refused, with the setting by which another is chosen."""
+    cells = box_simplices([20, 20, 20])  # 2e5 unknowns, 2.5 GB of factor
+    scene = make_scene(CUBE, {"tissue": {"order": 2}, "time": {"steps": 1000}})
+    work = replace(steps_of(scene, 200_000, 3, 1), contrast=49.0)
+    monkeypatch.setattr("softgrasp.fem.model.memory.steps_of", lambda *_: work)
+    check_memory(scene, MPI.COMM_SELF, True, 3, cells)
+    name = chosen(scene, work)[0]
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=3.5 * GIB))
+    assert (name, chosen(scene, work)[0]) == ("mumps", "mumps")
+    with pytest.raises(ResourceError, match=r"another solver by --set output\.memory=") as caught:
+        check_memory(scene, MPI.COMM_SELF, True, 3, cells)
+    allowed = float(str(caught.value).split("output.memory=")[1].split(",")[0])
+    lean = make_scene(CUBE, {"tissue": {"order": 2}, "time": {"steps": 1000}, "output": {"memory": allowed}})
+    check_memory(lean, MPI.COMM_SELF, True, 3, cells)
+    assert chosen(lean, work)[0] == "stars"
+
+
 @pytest.mark.parametrize("order", [1, 2])
 def test_finite_strain_counts_its_matrices(order: int) -> None:
     """B, B'AB, A and the pass over the points are a good part of what it adds, and no more than that."""
@@ -115,5 +135,5 @@ def test_finite_strain_counts_its_matrices(order: int) -> None:
     body.tangent(system.K_ee.createVecRight())
     matrices = (body.points.B, body.A, body.K, body.product)
     held = 12 * sum(A.getInfo()["nz_used"] for A in matrices if A is not None)  # a number and a column each
-    with_it, without = (need(s, 2, cells, 1, float("inf"), True).mesh for s in (model.scene, make_scene(tissue=tissue)))
+    with_it, without = (need(s, 2, cells, 1, True).mesh for s in (model.scene, make_scene(tissue=tissue)))
     assert 0.2 < held / (with_it - without) < 1
