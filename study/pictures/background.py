@@ -1,14 +1,16 @@
-"""Pictures drawn by a forked process while this one goes on computing."""
+"""What a forked process does while this one goes on computing: pictures, and shares of other work."""
 
 from __future__ import annotations
 
 import gc
+import io
 import multiprocessing
 import os
+import pickle
 import shutil
 import signal
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -27,48 +29,72 @@ PATIENCE = 20.0  # [s] without any processor time, after which the other process
 def draw_in_background(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[], list[Path]]:
     """Begin to draw into ``out``; the function returned waits for the files and names them on rank 0. Not collective.
 
-    What is drawn must be on this rank already: the process has all of it by fork, nothing is copied or packed, and only
-    the names come back. Several ranks have the cores taken, and their network may not survive a fork: with them, on
-    one core and where no process can be started, the pictures are drawn when they are asked for. So are those of a
-    process that stands still: a fork copies a lock that a thread of the network has, and not the thread that frees it.
+    Without another process, see :func:`forked`, the pictures are drawn when they are asked for.
 
     Raises (when they are asked for):
         Exception: what ``draw`` raised.
     """
     if comm.rank != 0:
         return list
-    if comm.size > 1 or len(os.sched_getaffinity(0)) < 2:
-        return partial(draw, out)
-    context = multiprocessing.get_context("fork")
-    receiver, sender = context.Pipe(duplex=False)
     folder = TemporaryDirectory(prefix="softgrasp-")
-    process = context.Process(target=_send, args=(sender, draw, Path(folder.name)), daemon=True)
-    try:
-        with warnings.catch_warnings():  # of threads that hold locks: the child takes none of theirs
-            warnings.simplefilter("ignore", DeprecationWarning)
-            process.start()
-    except OSError:
+    begun = forked(comm, partial(draw, Path(folder.name)))
+    if begun is None:
+        folder.cleanup()
         return partial(draw, out)
-    sender.close()
 
     def files() -> list[Path]:
         try:
-            done = receiver.recv() if _comes(receiver, process.pid) else OSError()
-        except EOFError:  # killed, for want of memory
-            done = OSError()
-        if isinstance(done, OSError):
-            process.kill()
-        process.join()
-        if isinstance(done, OSError):  # perhaps there is room in the folder itself
+            done = begun()
+        except OSError:  # perhaps there is room in the folder itself
             return draw(out)
-        if isinstance(done, Exception):
-            raise done
         out.mkdir(parents=True, exist_ok=True)
         with folder:
             note(*(out / file.name for file in done))
             return [Path(shutil.move(file, out / file.name)) for file in done]
 
     return files
+
+
+def forked[T](comm: MPI.Intracomm, call: Callable[[], T], same: Sequence[object] = ()) -> Callable[[], T] | None:
+    """Begin a call in a forked process; the function returned waits for the result. Not collective.
+
+    The process has everything that is here by fork, and only the result is packed, but for the objects of ``same`` in
+    it, which come back as those of this process. None where the caller has to call: on several ranks, which have the
+    cores taken, and whose network may not survive a fork, on one core and where no process can be started.
+
+    Raises (when the result is asked for):
+        OSError: the process was lost, or stood still: a fork copies a lock that a thread of the network has, and not
+            the thread that frees it.
+        Exception: what ``call`` raised.
+    """
+    if comm.size > 1 or len(os.sched_getaffinity(0)) < 2:
+        return None
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_send, args=(sender, call, same), daemon=True)
+    try:
+        with warnings.catch_warnings():  # of threads that hold locks: the child takes none of theirs
+            warnings.simplefilter("ignore", DeprecationWarning)
+            process.start()
+    except OSError:
+        return None
+    sender.close()
+
+    def result() -> T:
+        done: Any
+        try:
+            done = _unpacked(receiver.recv_bytes(), same) if _comes(receiver, process.pid) else OSError("stood still")
+        except EOFError:  # killed, for want of memory
+            done = OSError("killed")
+        if isinstance(done, OSError):
+            process.kill()
+        process.join()
+        if isinstance(done, Exception):
+            raise done
+        found: T = done
+        return found
+
+    return result
 
 
 def _comes(receiver: Connection, pid: int | None) -> bool:
@@ -82,12 +108,33 @@ def _comes(receiver: Connection, pid: int | None) -> bool:
     return True
 
 
-def _send(sender: Any, draw: Draw, folder: Path) -> None:
-    """Draw in the child, and send the names or the error; Ctrl-C ends it at once."""
+def _send(sender: Connection, call: Callable[[], Any], same: Sequence[object]) -> None:
+    """Call in the child, and send the result or the error; Ctrl-C ends it at once."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)
     gc.disable()  # what belongs to PETSc and MPI is not this process's to free
     try:
-        sender.send(draw(folder))
+        packed = _packed(call(), same)
     except Exception as error:
-        sender.send(error)
+        packed = _packed(error, ())
+    sender.send_bytes(packed)
+
+
+def _packed(result: object, same: Sequence[object]) -> bytes:
+    places = {id(each): i for i, each in enumerate(same)}
+
+    class Packer(pickle.Pickler):
+        def persistent_id(self, obj: object) -> int | None:
+            return places.get(id(obj))
+
+    file = io.BytesIO()
+    Packer(file, pickle.HIGHEST_PROTOCOL).dump(result)
+    return file.getvalue()
+
+
+def _unpacked(packed: bytes, same: Sequence[object]) -> Any:
+    class Unpacker(pickle.Unpickler):
+        def persistent_load(self, pid: Any) -> object:
+            return same[pid]
+
+    return Unpacker(io.BytesIO(packed)).load()

@@ -21,6 +21,7 @@ from softgrasp.reduction.errors import all_at, prepare
 from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
+from softgrasp.study.pictures.background import forked
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
     LARGER,
@@ -232,18 +233,37 @@ def sweep(
 def sweep_all(
     names: Sequence[str], full: FullRun, say: Say, options: Reduction | None = None
 ) -> tuple[MethodSweep, ...]:
-    """Every method at all N of the options, None for those of the scene. Collective."""
+    """Every method at all N of the options, None for those of the scene. Collective.
+
+    On one rank with a free core a forked process measures every other method whose bases are made.
+    """
     options = options or full.model.scene.reduction
     size = len(options.N)
 
-    def swept(i: int, done: int, of: int) -> None:
-        say(names[i], size * i + size * done // of, size * len(names))
-
     states = states_of(full.model.system, full.snapshots)
     made = made_apart([(name, options.N) for name in names], states, options)
-    return tuple(
-        sweep(name, full, options, partial(swept, i), made.pop(name, None), states) for i, name in enumerate(names)
-    )
+    beside = [name for name in names if name in made][1::2] if MPI.COMM_WORLD.size == 1 else []
+
+    def swept(chosen: Sequence[str], tell: Callable[[str, int, int], None]) -> dict[str, MethodSweep]:
+        return {
+            name: sweep(name, full, options, partial(tell, name), made.get(name), states) for name in chosen
+        }  # fmt: skip
+
+    def tell(name: str, done: int, of: int) -> None:
+        say(name, size * names.index(name) + size * done // of, size * len(names))
+
+    def quietly() -> dict[str, MethodSweep]:
+        return swept(beside, lambda name, done, of: None)
+
+    layout = full.model.system.layout
+    begun = forked(layout.comm, quietly, (layout, *map(registry.find_method, beside))) if beside else None
+    found = swept([name for name in names if begun is None or name not in beside], tell)
+    if begun is not None:
+        try:
+            found |= begun()
+        except OSError:  # the other process was lost
+            found |= swept(beside, tell)
+    return tuple(found[name] for name in names)
 
 
 def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | None) -> list[TestedModel]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ from softgrasp.reduction.bases.states import BasisError, States, states_of
 from softgrasp.reduction.parameters import training_of, training_states
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, full_run, replay_linear
+from softgrasp.study.reduce.linear import measure
 from softgrasp.study.reduce.linear.measure import (
     FURTHER,
     bases_of,
@@ -235,6 +239,42 @@ def test_bases_of_one_rank_or_of_threads_are_those_of_all_ranks_together(small: 
             V, W = (np.linalg.qr(X[:, first:] / np.linalg.norm(X[:, first:], axis=0))[0] for X in (V, W))
             # rounding of the snapshots over the gap of the singular values
             assert np.linalg.norm(V - W @ (W.T @ V)) < 1e-6, (name, one.N)
+
+
+@pytest.mark.serial
+@pytest.mark.skipif(cores() == 1, reason="one core measures all by itself")
+def test_methods_measured_by_another_process_have_the_same_numbers(
+    small: FullRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other process has the bases of this one: the same bits. A process that is lost is replaced."""
+    names, here = ("pod_fixed", "psd_fixed", "psd_svd_like_fixed", "craig_bampton"), os.getpid()
+    measured_here: list[str] = []
+
+    def swept(lost: bool = False) -> list[Any]:
+        measured_here.clear()
+
+        def counted(name: str, *args: Any) -> Any:
+            if lost and os.getpid() != here:
+                os.kill(os.getpid(), signal.SIGKILL)
+            measured_here.append(name)
+            return sweep(name, *args)
+
+        monkeypatch.setattr(measure, "sweep", counted)
+        found = measure.sweep_all(names, small, lambda what, done, of: None, wanted(small, [8, 14, 4000]))
+        assert all(m.reconstruction.layout is small.model.system.layout for s in found for m in s.models.values())
+        timeless = [
+            [{key: value for key, value in asdict(p).items() if not key.startswith("time")} for p in s.points]
+            for s in found
+        ]
+        return [(s.method, s.refused, s.N_energy, points) for s, points in zip(found, timeless, strict=True)]
+
+    shared = swept()
+    assert measured_here == [name for name in names if name != "psd_fixed"]
+    assert swept(lost=True) == shared
+    assert sorted(measured_here) == sorted(names)
+    monkeypatch.setattr(measure, "forked", lambda *args: None)
+    assert swept() == shared
+    assert measured_here == list(names)
 
 
 def test_an_error_in_a_thread_is_raised_and_gives_the_turn_back() -> None:
