@@ -22,7 +22,8 @@ from softgrasp.study.precision.full import FullRuns, Series, errors_of
 from softgrasp.study.precision.points import BasisPoint, ReducedPoint
 from softgrasp.study.precision.result import Question, ReferenceSolution
 from softgrasp.study.precision.settings import Setting
-from softgrasp.study.reduce.linear.measure import bases_of, chosen_methods, measured
+from softgrasp.study.reduce.linear.bases import bases_of
+from softgrasp.study.reduce.linear.measure import chosen_methods, measured
 from softgrasp.study.reduce.linear.result import Point
 from softgrasp.study.shell import repeated
 
@@ -77,7 +78,9 @@ class ReducedRuns:
         def sweep() -> list[TimedModel]:
             against, probe = self.full()
             bases, _ = bases_of(name, states_of(against.model.system, against.snapshots), section.N, section, {})
-            return [_timed_model(model, point, against, probe) for model, point in measured(bases, against, {})]
+            return [
+                _timed_model(each.model, each.timed(against), against, probe) for each in measured(bases, against, {})
+            ]
 
         label = f"{find_method(name).title}, {self.setting.label}"
         models = self.runs.cache.point(label, "reduced", key, TimedModel, sweep)

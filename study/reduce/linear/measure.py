@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, replace
-from functools import partial
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem import Reduction, Scene
-from softgrasp.fem.errors import raise_on_all_ranks
-from softgrasp.fem.layout import BlockLayout
-from softgrasp.reduction import Basis, ModelComparison, ModelError, ReducedModel, Truncation, project_scene, registry
-from softgrasp.reduction.bases.aside import cores, in_threads
-from softgrasp.reduction.bases.states import BasisError, States, states_of, whole_states
+from softgrasp.reduction import Basis, ModelComparison, ModelError, ReducedModel, project_scene, registry
+from softgrasp.reduction.bases.states import States, states_of
 from softgrasp.reduction.errors import all_at, prepare
 from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
+from softgrasp.reduction.propagator import Propagator
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
 from softgrasp.study.pictures.background import forked
+from softgrasp.study.reduce.linear.bases import Made, bases_of, made_apart
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
     LARGER,
@@ -44,7 +43,6 @@ REPEATS, SETUPS = 5, 3  # behind each median of the online time and of the set-u
 METHODS_TESTED = 4  # over the box
 PAPER_SIZES = 956, 600  # n_e and steps of its forward run
 PAPER_FULL, PAPER_REDUCED = 16.22, 0.097  # seconds of [SBRH21]: 2n = 1916, 600 steps, and PSD at N = 14
-WHOLE_BYTES = 2.0**28  # of all snapshots up to which each rank holds their rows and makes bases by itself
 LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
 
 Progress = Callable[[int, int], None]
@@ -68,94 +66,10 @@ def chosen_methods(scene: Scene) -> tuple[str, ...]:
     return names
 
 
-def bases_of(
-    name: str, states: States, sizes: list[int], options: Reduction, refused: dict[int, str]
-) -> tuple[tuple[Basis, ...], int | None]:
-    """Bases at all sizes that the snapshots carry, and the columns that keep the scene's share of the energy.
-
-    What does not fit is put into ``refused`` by its N, with the reason. Collective.
-    """
-    method, n_s = registry.find_method(name), states.system.layout.n_s
-    inner = None if options.inner == "auto" or not method.snapshots else options.inner
-    rule = [Truncation(energy=options.energy)] if method.snapshots else []
-    refused |= registry.impossible_sizes(method, n_s, sizes)
-    sizes = registry.possible_sizes(method, n_s, sizes)
-    while sizes or rule:
-        try:
-            bases = registry.make_bases(name, states, [*sizes, *rule], inner, options.engine)
-        except BasisError as error:
-            most = error.most
-            larger = [N for N in sizes if most is not None and most < N]
-            if not larger and rule:
-                rule = []  # it may be the share that fails; what fails in general fails again
-                continue
-            limit = "the snapshots carry above rounding" if method.snapshots else "this mesh has modes for"
-            reason = f"more than {limit}; request N <= {most}" if larger else error.reason
-            refused |= dict.fromkeys(larger or sizes, reason)
-            sizes = [N for N in sizes if larger and N not in larger]
-        else:
-            return bases[: len(sizes)], bases[-1].N if rule else None
-    return (), None
-
-
-Made = tuple[tuple[Basis, ...], int | None, dict[int, str]]
-"""Bases of one method, the columns that keep the scene's share of the energy, and the sizes refused."""
-
-
-def made_apart(tasks: Sequence[tuple[str, list[int]]], states: States, options: Reduction) -> dict[str, Made]:
-    """Bases of several methods, each made by one rank alone, with all rows of small snapshots. Collective.
-
-    A rank that is alone makes them by threads. Left out, because all ranks make them together later: everything for
-    large snapshots or on one core, and methods that use more than snapshots and matrices.
-
-    ``tasks``: names and sizes.
-
-    Raises SolverError: a factorisation failed.
-    """
-    comm, layout = states.layout.comm, states.layout
-    size = sum(16 * layout.n_e * snapshots.Z.shape[1] for _, snapshots in states.runs)
-    apart = [(name, sizes) for name, sizes in tasks if name in registry.METHODS and registry.METHODS[name].snapshots]
-    few = comm.size * (cores() if MPI.COMM_WORLD.size == 1 else 1) == 1  # threads beside ranks would share their cores
-    if comm.bcast(few) or len(apart) < 2 or not 0 < size <= WHOLE_BYTES:
-        return {}
-    # pairs factor twice as many columns: they are dealt first
-    apart.sort(key=lambda task: not registry.METHODS[task[0]].pairs)
-    whole, made = whole_states(states) if comm.size > 1 else states, dict[str, Made]()
-
-    def make(name: str, sizes: list[int]) -> Made:
-        refused: dict[int, str] = {}
-        return *bases_of(name, whole, sizes, options, refused), refused
-
-    own = apart[comm.rank :: comm.size]
-    with raise_on_all_ranks(comm):
-        if comm.size == 1:
-            results = in_threads([partial(make, *task) for task in own])
-        else:
-            results = [make(*task) for task in own]
-        made = {name: result for (name, _), result in zip(own, results, strict=True)}
-    if comm.size == 1:
-        return made
-    return {name: _dealt(layout, made.get(name), i % comm.size) for i, (name, _) in enumerate(apart)}
-
-
-def _dealt(layout: BlockLayout, made: Made | None, owner: int) -> Made:
-    """The local rows of bases whose rows are all on one rank. Collective."""
-    starts, parts = layout.comm.allgather((layout.start, layout.n_local)), None
-    nowhere: Any = None  # a communicator cannot be sent
-    if made is not None:
-        bases, *about = made
-        parts = [
-            (tuple(replace(b, layout=nowhere, V_q=b.V_q[i : i + n], V_p=b.V_p[i : i + n]) for b in bases), *about)
-            for i, n in starts
-        ]
-    bases, kept, refused = layout.comm.scatter(parts, root=owner)
-    return tuple(replace(b, layout=layout) for b in bases), kept, refused
-
-
 def measured(
     bases: Sequence[Basis], full: FullRun, refused: dict[int, str], progress: Progress = lambda done, of: None
-) -> Iterator[tuple[ReducedModel, Point]]:
-    """Models of nested bases with their errors and times; one without a run is put into ``refused``. Collective."""
+) -> Iterator[Measured]:
+    """Models of nested bases with their errors; one without a run is put into ``refused``. Collective."""
     if not bases:
         return
     outputs = full.model.outputs
@@ -165,14 +79,36 @@ def measured(
         progress(i, len(bases))
         model = project_scene(basis, full.model, outputs)
         try:
-            point = measure(model, full, comparison)
+            yield measure(model, full, comparison)
         except ModelError as error:
             refused[basis.N] = error.reason
-        else:
-            yield model, point
 
 
-def measure(model: ReducedModel, full: FullRun, comparison: ModelComparison) -> Point:
+@dataclass(frozen=True)
+class Measured:
+    """One reduced model with its errors, before its times."""
+
+    model: ReducedModel
+    point: Point  # without times of set-up and run
+    step: Propagator  # at the scene's own parameter
+    drive: dict[str, Any]  # keywords of its run
+
+    def light(self, full: FullRun) -> Measured:
+        """The same without rows on the mesh, unless a new run needs them for its start."""
+        if full.model.scene.time.start == "equilibrium":
+            return self
+        return replace(self, model=replace(self.model, reconstruction=None))
+
+    def timed(self, full: FullRun) -> Point:
+        """The point with the times of set-up and run, medians of processor time. Collective."""
+        comm, model = full.model.system.layout.comm, self.model
+        with np.errstate(all="ignore"):  # an unstable model may overflow, and is marked
+            setup = median_processor_seconds(comm, lambda: replay_inputs(model, model.at(), full)[0].stable, SETUPS)
+            online = median_processor_seconds(comm, lambda: run(self.step, allow_unstable=True, **self.drive), REPEATS)
+        return replace(self.point, time_setup=setup, time_online=online)
+
+
+def measure(model: ReducedModel, full: FullRun, comparison: ModelComparison) -> Measured:
     """Run one reduced model at the scene's own parameter and compare. Collective.
 
     ``comparison``: of the largest model of the family. Raises ModelError: E or A is singular, so that the model has no
@@ -183,9 +119,7 @@ def measure(model: ReducedModel, full: FullRun, comparison: ModelComparison) -> 
         small = model.at()
         step, drive = replay_inputs(model, small, full)
         errors = comparison.errors(model, small, run(step, allow_unstable=True, **drive))
-        setup = median_processor_seconds(layout.comm, lambda: replay_inputs(model, model.at(), full)[0].stable, SETUPS)
-        online = median_processor_seconds(layout.comm, lambda: run(step, allow_unstable=True, **drive), REPEATS)
-    return Point(
+    point = Point(
         N=model.N,
         N_tissue=model.N - (2 * layout.n_s if model.fixed_solid else 0),
         split=model.split,
@@ -193,41 +127,65 @@ def measure(model: ReducedModel, full: FullRun, comparison: ModelComparison) -> 
         projection_error_deformation=comparison.projection_error("deformation", model, small),
         projection_error=comparison.projection_error("velocities", model, small),
         time_offline=float(layout.comm.allreduce(sum(model.seconds.values()), MPI.MAX)),
-        time_setup=setup,
-        time_online=online,
+        time_setup=math.nan,
+        time_online=math.nan,
         spectral_abscissa=small.spectral_abscissa,
         stable=small.stable,
     )
+    return Measured(model, point, step, drive)
 
 
-def sweep(
+@dataclass(frozen=True)
+class Untimed:
+    """One method at all its N, before its times; see :class:`MethodSweep`."""
+
+    name: str  # key of the method
+    found: list[Measured]
+    refused: dict[int, str]
+    N_energy: int | None
+    bases: tuple[tuple[np.ndarray, ...], str]  # singular values and inner product
+
+    def timed(self, full: FullRun) -> MethodSweep:
+        """The method with its times. Collective."""
+        points = tuple(each.timed(full) for each in self.found)
+        models = {each.model.N: each.model for each in self.found if each.model.N in kept_points(points)}
+        sigma, inner = self.bases
+        refused = dict(sorted(self.refused.items()))
+        return MethodSweep(registry.find_method(self.name), points, models, sigma, refused, self.N_energy, inner)
+
+
+def untimed(
     name: str,
     full: FullRun,
     options: Reduction,
     progress: Progress = lambda done, of: None,
     made: Made | None = None,
     states: States | None = None,
-) -> MethodSweep:
-    """One method at all its N. Collective. Raises SolverError: a factorisation failed.
+) -> Untimed:
+    """One method at all its N without times. Collective. Raises SolverError: a factorisation failed.
 
     Args:
-        made: its bases, as of :func:`made_apart`; None: made here.
+        made: its bases, as of :func:`softgrasp.study.reduce.linear.bases.made_apart`; None: made here.
         states: of the run, which several methods share; None: made here.
     """
     refused: dict[int, str] = {}
     if made is None:
         states = states or states_of(full.model.system, full.snapshots)
         made = *bases_of(name, states, options.N, options, refused), refused
-    bases, kept, refused = made
-    points: list[Point] = []
-    models: dict[int, ReducedModel] = {}
-    for model, point in measured(bases, full, refused, progress):
-        points.append(point)
-        models[model.N] = model
-        models = {N: models[N] for N in models if N in kept_points(points)}
-    sigma, inner = (bases[0].sigma, bases[0].inner) if bases else ((), "")
-    about = dict(sorted(refused.items())), kept, inner
-    return MethodSweep(registry.find_method(name), tuple(points), models, sigma, *about)
+    bases, N_energy, refused = made
+    found: list[Measured] = []
+    for each in measured(bases, full, refused, progress):
+        found.append(each)
+        kept = kept_points([one.point for one in found])
+        found = [one if one.model.N in kept else one.light(full) for one in found]
+    return Untimed(name, found, refused, N_energy, (bases[0].sigma, bases[0].inner) if bases else ((), ""))
+
+
+def sweep(
+    name: str, full: FullRun, options: Reduction, progress: Progress = lambda done, of: None, made: Made | None = None
+) -> MethodSweep:
+    """One method at all its N, as :func:`untimed`, with its times. Collective. Raises SolverError: as there."""
+    return untimed(name, full, options, progress, made).timed(full)
 
 
 def sweep_all(
@@ -235,35 +193,40 @@ def sweep_all(
 ) -> tuple[MethodSweep, ...]:
     """Every method at all N of the options, None for those of the scene. Collective.
 
-    On one rank with a free core a forked process measures every other method whose bases are made.
+    On one rank with a free core a forked process measures every other method whose bases are made. Times are taken
+    afterwards, by one process at a time.
     """
     options = options or full.model.scene.reduction
     size = len(options.N)
-
     states = states_of(full.model.system, full.snapshots)
     made = made_apart([(name, options.N) for name in names], states, options)
-    beside = [name for name in names if name in made][1::2] if MPI.COMM_WORLD.size == 1 else []
+    beside = [name for name in names if name in made][1::2]
 
-    def swept(chosen: Sequence[str], tell: Callable[[str, int, int], None]) -> dict[str, MethodSweep]:
-        return {
-            name: sweep(name, full, options, partial(tell, name), made.get(name), states) for name in chosen
-        }  # fmt: skip
+    def one(name: str, tell: Say) -> Untimed:
+        def progress(done: int, of: int) -> None:
+            tell(name, size * names.index(name) + size * done // of, size * len(names))
 
-    def tell(name: str, done: int, of: int) -> None:
-        say(name, size * names.index(name) + size * done // of, size * len(names))
+        return untimed(name, full, options, progress, made.pop(name, None), states)
 
-    def quietly() -> dict[str, MethodSweep]:
-        return swept(beside, lambda name, done, of: None)
+    def share(pause: Callable[[], None]) -> list[MethodSweep]:
+        halves = [one(name, lambda what, done, of: None) for name in beside]
+        pause()
+        return [half.timed(full) for half in halves]
 
-    layout = full.model.system.layout
-    begun = forked(layout.comm, quietly, (layout, *map(registry.find_method, beside))) if beside else None
-    found = swept([name for name in names if begun is None or name not in beside], tell)
-    if begun is not None:
+    other = forked(share, (full.model.system.layout, *map(registry.find_method, beside))) if beside else None
+    if other is None:
+        return tuple(one(name, say).timed(full) for name in names)
+    for name in beside:
+        del made[name]  # the other process has them
+    with other:
+        halves = [one(name, say) for name in names if name not in beside]
         try:
-            found |= begun()
-        except OSError:  # the other process was lost
-            found |= swept(beside, tell)
-    return tuple(found[name] for name in names)
+            other.wait()
+            sweeps = [half.timed(full) for half in halves] + other.result()
+        except OSError:  # it was lost
+            halves += [one(name, say) for name in beside]
+            sweeps = [half.timed(full) for half in halves]
+    return tuple(sorted(sweeps, key=lambda s: names.index(s.method.key)))
 
 
 def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | None) -> list[TestedModel]:

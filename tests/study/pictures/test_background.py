@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.study.pictures import background
-from softgrasp.study.pictures.background import draw_in_background
+from softgrasp.study.pictures.background import draw_in_background, forked
 
 HERE = os.getpid()
 COMM = MPI.COMM_WORLD
@@ -78,3 +79,29 @@ def test_a_process_that_stands_still_is_given_up(tmp_path: Path, monkeypatch: py
     files = draw_in_background(COMM, tmp_path, computes)
     assert files() == [tmp_path / "drawn.png"]
     assert (tmp_path / "drawn.png").read_text() != str(HERE) or len(os.sched_getaffinity(0)) == 1
+
+
+@pytest.mark.serial
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) == 1, reason="one core has no other process")
+def test_a_call_that_pauses_goes_on_when_it_is_asked_for(tmp_path: Path) -> None:
+    """So that the times of either process are taken while the other one does nothing."""
+    same = object()
+
+    def works(pause: Callable[[], None]) -> tuple[float, object]:
+        pause()
+        return time.monotonic(), same
+
+    other = forked(works, (same,))
+    assert other is not None
+    with other:
+        other.wait()
+        time.sleep(0.1)
+        asked = time.monotonic()
+        went_on, back = other.result()
+    assert went_on >= asked
+    assert back is same
+    left = forked(lambda pause: time.sleep(100))
+    assert left is not None
+    with pytest.raises(SceneError), left:
+        raise SceneError("an error here ends the other process")
+    assert not left.process.is_alive()

@@ -23,14 +23,8 @@ from softgrasp.reduction.parameters import training_of, training_states
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, full_run, replay_linear
 from softgrasp.study.reduce.linear import measure
-from softgrasp.study.reduce.linear.measure import (
-    FURTHER,
-    bases_of,
-    box_models,
-    made_apart,
-    measure_box,
-    sweep,
-)
+from softgrasp.study.reduce.linear.bases import bases_of, made_apart
+from softgrasp.study.reduce.linear.measure import FURTHER, box_models, measure_box, sweep, untimed
 from tests.helpers.models import gather_matrix, gather_rows, gather_states, make_scene
 
 PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"
@@ -257,11 +251,12 @@ def test_methods_measured_by_another_process_have_the_same_numbers(
             if lost and os.getpid() != here:
                 os.kill(os.getpid(), signal.SIGKILL)
             measured_here.append(name)
-            return sweep(name, *args)
+            return untimed(name, *args)
 
-        monkeypatch.setattr(measure, "sweep", counted)
+        monkeypatch.setattr(measure, "untimed", counted)
         found = measure.sweep_all(names, small, lambda what, done, of: None, wanted(small, [8, 14, 4000]))
         assert all(m.reconstruction.layout is small.model.system.layout for s in found for m in s.models.values())
+        assert all(p.time_setup > 0 and p.time_online > 0 for s in found for p in s.points)
         timeless = [
             [{key: value for key, value in asdict(p).items() if not key.startswith("time")} for p in s.points]
             for s in found
