@@ -22,6 +22,7 @@ from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.run.states.snapshots import Snapshots
 from softgrasp.fem.shown import Card, Shown, percent
 from softgrasp.fem.system import BlockSystem
+from softgrasp.reduction.bases.condense import Condensed
 from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import ReducedTrajectory
@@ -149,6 +150,9 @@ def spans_in(bases: Sequence[tuple[View, Array]], system: BlockSystem, snapshots
     ``bases``: view and Q of each.
     """
     comm, n = system.layout.comm, system.layout.n_local
+    whole_run: Condensed | None = snapshots.kept.get(Condensed)
+    if whole_run is not None:
+        snapshots = whole_run.few
     C: list[list[Array]] = [[] for _ in bases]
     rests, whole = np.zeros(len(bases)), dict.fromkeys((view for view, _ in bases), 0.0)
     for b in column_blocks(snapshots.Z.shape[1]):
@@ -163,7 +167,10 @@ def spans_in(bases: Sequence[tuple[View, Array]], system: BlockSystem, snapshots
     left = total(comm, np.array([*whole.values(), *rests])).tolist()
     square = dict(zip(whole, left, strict=False))
     every = zip(bases, C, left[len(whole) :], strict=True)
-    return [Span(comm, Q, np.hstack(c), rest, square[view]) for (view, Q), c, rest in every]
+    parts = [(view, Q, np.hstack(c), rest) for (view, Q), c, rest in every]
+    if whole_run is not None:
+        parts = [(view, Q, c @ whole_run.W.T, rest) for view, Q, c, rest in parts]
+    return [Span(comm, Q, c, rest, square[view]) for view, Q, c, rest in parts]
 
 
 @dataclass(frozen=True)

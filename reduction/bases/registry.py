@@ -183,7 +183,7 @@ def make_bases(
     clock.append(time.thread_time())
     seconds = dict(zip(("snapshots", "factor", "vectors"), np.diff(clock).tolist(), strict=True))
     # offline times of a method are those of the method alone
-    seconds["snapshots"] = snapshots.kept.setdefault("seconds", seconds["snapshots"])
+    seconds["snapshots"] = snapshots.kept.setdefault("seconds", seconds["snapshots"]) + states.condensing
     seconds["factor"] += sum(request.spared)
     whole = Basis(
         method.key, states.layout, *(np.zeros((0, 0)),) * 4, method.coordinates, method.frame, method.structure,

@@ -65,6 +65,7 @@ class States:
 
     system: BlockSystem  # operators that the inner products use
     runs: tuple[tuple[BlockSystem, Snapshots], ...] = ()  # pairs of system and snapshots, all on one layout
+    condensing: float = 0.0  # processor time in which the columns of the runs became few [s]
     # the last row blocks with their coordinates and frame, for the next basis
     kept: dict[tuple[Coordinates, Frame], Columns] = field(default_factory=dict, repr=False, compare=False)
 
@@ -72,6 +73,17 @@ class States:
     def layout(self) -> BlockLayout:
         """Sizes and ownership."""
         return self.system.layout
+
+    def check(self) -> None:
+        """Check the runs. Collective.
+
+        Raises BasisError: there are no snapshots, they do not fit, or one of them is not finite.
+        """
+        if not any(snapshots.Z.shape[1] for _, snapshots in self.runs):
+            raise BasisError("there are no snapshots; run with output.snapshots = 'memory', or use craig_bampton")
+        with raise_on_all_ranks(self.layout.comm):
+            for system, snapshots in self.runs:
+                _check(self.layout, system, snapshots)
 
     def columns(self, coordinates: Coordinates, frame: Frame) -> Columns:
         """Copy the snapshots into row blocks; the last ones stay for bases of the same coordinates. Collective.
@@ -89,11 +101,7 @@ class States:
         """
         if known := self.kept.get((coordinates, frame)):
             return known
-        if not any(snapshots.Z.shape[1] for _, snapshots in self.runs):
-            raise BasisError("there are no snapshots; run with output.snapshots = 'memory', or use craig_bampton")
-        with raise_on_all_ranks(self.layout.comm):
-            for system, snapshots in self.runs:
-                _check(self.layout, system, snapshots)
+        self.check()
         parts = [_columns(system, snapshots, coordinates, frame) for system, snapshots in self.runs]
         self.kept.clear()
         self.kept[coordinates, frame] = made = parts[0] if len(parts) == 1 else Columns.beside(parts)
@@ -114,7 +122,7 @@ def whole_states(states: States) -> States:
         return replace(snapshots, layout=own, Z=Z)
 
     runs = tuple((whole_system(run), gathered(snapshots)) for run, snapshots in states.runs)
-    return States(system, runs)
+    return States(system, runs, states.condensing)
 
 
 def states_of(system: BlockSystem, snapshots: Snapshots | None = None) -> States:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,8 @@ class Snapshots(Shown):
     q_s: Array  # hand, (n_s, m), on every rank
     v_s: Array  # its velocity, alike
     Z: Array  # local rows of [z; v_z] relative to the hand, (2 n_local, m), Fortran order
+    # what is made of these columns once for several users, by its type
+    kept: dict[type, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def displacement(self, T: Array) -> Array:
         """Absolute displacement q_e = z + T q_s, local rows (n_local, m)."""

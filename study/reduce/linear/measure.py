@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -13,7 +14,8 @@ from mpi4py import MPI
 
 from softgrasp.fem import Reduction, Scene
 from softgrasp.reduction import Basis, ModelComparison, ModelError, ReducedModel, project_scene, registry
-from softgrasp.reduction.bases.states import States, states_of
+from softgrasp.reduction.bases.condense import condensed
+from softgrasp.reduction.bases.states import BasisError, States, states_of
 from softgrasp.reduction.errors import all_at, prepare
 from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
@@ -198,7 +200,9 @@ def sweep_all(
     """
     options = options or full.model.scene.reduction
     size = len(options.N)
-    states = states_of(full.model.system, full.snapshots)
+    every = states = states_of(full.model.system, full.snapshots)
+    with suppress(BasisError):  # each method states what is wrong with the snapshots
+        states = condensed(every)
     made = made_apart([(name, options.N) for name in names], states, options)
     beside = [name for name in names if name in made][1::2]
 
@@ -206,7 +210,8 @@ def sweep_all(
         def progress(done: int, of: int) -> None:
             tell(name, size * names.index(name) + size * done // of, size * len(names))
 
-        return untimed(name, full, options, progress, made.pop(name, None), states)
+        own = states if name in registry.METHODS else every  # a user's basis may need the columns in time
+        return untimed(name, full, options, progress, made.pop(name, None), own)
 
     def share(pause: Callable[[], None]) -> list[MethodSweep]:
         halves = [one(name, lambda what, done, of: None) for name in beside]
