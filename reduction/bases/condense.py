@@ -45,8 +45,8 @@ def condensed(states: States) -> States:
 
 def condense(snapshots: Snapshots) -> Condensed:
     """Few columns of finite snapshots, or all of them where few would not pay. Collective."""
-    made: Condensed
-    if made := snapshots.kept.get(Condensed):
+    made: Condensed | None = snapshots.kept.get(Condensed)
+    if made is not None:
         return made
     comm, n, m = snapshots.layout.comm, snapshots.layout.n_local, snapshots.Z.shape[1]
     q_s, v_s = snapshots.q_s, snapshots.v_s

@@ -26,7 +26,6 @@ from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.petsc import Array, PETSc, folded, from_options, on_root, total
-from softgrasp.reduction.bases.aside import aside
 from softgrasp.reduction.bases.states import BasisError
 
 EngineName = Literal["tsqr", "svd", "gram"]
@@ -225,8 +224,7 @@ def small_svd(comm: MPI.Intracomm, R: Any) -> tuple[Any, Array, Any]:
 
     def call() -> tuple[Any, Array, Any]:
         try:
-            with aside():
-                U, s, V_h = np.linalg.svd(R, full_matrices=False)
+            U, s, V_h = np.linalg.svd(R, full_matrices=False)
         except np.linalg.LinAlgError:
             U, s, V_h = scipy.linalg.svd(R, full_matrices=False, lapack_driver="gesvd")
         pivot = V_h[np.arange(len(s)), np.abs(V_h).argmax(axis=1)]

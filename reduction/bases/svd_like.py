@@ -9,7 +9,6 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root
-from softgrasp.reduction.bases.aside import aside
 from softgrasp.reduction.bases.engines import EPS, SNAPSHOT_ROUNDING
 from softgrasp.reduction.bases.states import BasisError
 
@@ -95,8 +94,7 @@ class _PairSelection:
 
     def _compress(self, rest: Array) -> None:
         """Set rest, U, s and size to the few columns that span the same space; X'JX is rotated only."""
-        with aside():
-            U, s, _ = np.linalg.svd(rest, full_matrices=False)
+        U, s, _ = np.linalg.svd(rest, full_matrices=False)
         keep = s > max(EPS * s[0], 0.01 * SNAPSHOT_ROUNDING * self.largest) if len(s) else s > 0
         self.U, self.s = U[:, keep], s[keep]
         self.rest = self.U * self.s

@@ -1,22 +1,18 @@
-"""Bases of several methods at all N: what the snapshots carry, and which rank or thread makes which."""
+"""Bases of several methods at all N: what the snapshots carry, and which rank or process makes which."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
-
-from mpi4py import MPI
 
 from softgrasp.fem import Reduction
 from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.reduction import Basis, Truncation, registry
-from softgrasp.reduction.bases.aside import cores, in_threads
 from softgrasp.reduction.bases.states import BasisError, States, whole_states
 
-WHOLE_BYTES = 2.0**28  # of all snapshots up to which each rank holds their rows and makes bases by itself
+WHOLE_BYTES = 2.0**28  # of all snapshots up to which each rank or process holds their rows
 
 
 def bases_of(
@@ -54,39 +50,52 @@ Made = tuple[tuple[Basis, ...], int | None, dict[int, str]]
 
 
 def made_apart(tasks: Sequence[tuple[str, list[int]]], states: States, options: Reduction) -> dict[str, Made]:
-    """Bases of several methods, each made by one rank alone, with all rows of small snapshots. Collective.
+    """Bases of several methods, each made by one of several ranks, with all rows of small snapshots. Collective.
 
-    A rank that is alone makes them by threads. Left out, because all ranks make them together later: everything for
-    large snapshots or on one core, and methods that use more than snapshots and matrices.
+    Left out, because all ranks make them together later: everything for large snapshots, and methods that use more
+    than snapshots and matrices.
 
     ``tasks``: names and sizes.
 
     Raises SolverError: a factorisation failed.
     """
     comm, layout = states.layout.comm, states.layout
-    size = sum(16 * layout.n_e * snapshots.Z.shape[1] for _, snapshots in states.runs)
     apart = [(name, sizes) for name, sizes in tasks if name in registry.METHODS and registry.METHODS[name].snapshots]
-    few = comm.size * (cores() if MPI.COMM_WORLD.size == 1 else 1) == 1  # threads beside ranks would share their cores
-    if comm.bcast(few) or len(apart) < 2 or not 0 < size <= WHOLE_BYTES:
+    if comm.size == 1 or len(apart) < 2 or not small(states):
         return {}
     # pairs factor twice as many columns: they are dealt first
     apart.sort(key=lambda task: not registry.METHODS[task[0]].pairs)
-    whole, made = whole_states(states) if comm.size > 1 else states, dict[str, Made]()
-
-    def make(name: str, sizes: list[int]) -> Made:
-        refused: dict[int, str] = {}
-        return *bases_of(name, whole, sizes, options, refused), refused
-
-    own = apart[comm.rank :: comm.size]
+    whole, made = whole_states(states), dict[str, Made]()
     with raise_on_all_ranks(comm):
-        if comm.size == 1:
-            results = in_threads([partial(make, *task) for task in own])
-        else:
-            results = [make(*task) for task in own]
-        made = {name: result for (name, _), result in zip(own, results, strict=True)}
-    if comm.size == 1:
-        return made
+        for name, sizes in apart[comm.rank :: comm.size]:
+            refused: dict[int, str] = {}
+            made[name] = *bases_of(name, whole, sizes, options, refused), refused
     return {name: _dealt(layout, made.get(name), i % comm.size) for i, (name, _) in enumerate(apart)}
+
+
+def small(states: States) -> bool:
+    """Whether there are snapshots, and so few that each rank or process may hold all that is made of them."""
+    size = sum(16 * states.layout.n_e * snapshots.Z.shape[1] for _, snapshots in states.runs)
+    return 0 < size <= WHOLE_BYTES
+
+
+def two_shares(names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Methods for two processes with about equal work; those that share a tall factor stay together."""
+    groups: dict[object, list[str]] = {}
+    for name in names:
+        method = registry.find_method(name)
+        groups.setdefault((method.snapshots, method.coordinates, method.frame, method.inner), []).append(name)
+    if len(groups) == 1:
+        return list(names[::2]), list(names[1::2])
+
+    def work(share: Sequence[str]) -> int:  # pairs have twice the columns, and several decompositions
+        methods = [registry.find_method(name) for name in share]
+        return sum(3 if method.pairs and method.snapshots else 1 for method in methods)
+
+    shares: tuple[list[str], list[str]] = [], []
+    for group in sorted(groups.values(), key=work, reverse=True):
+        min(shares, key=work).extend(group)
+    return shares
 
 
 def _dealt(layout: BlockLayout, made: Made | None, owner: int) -> Made:

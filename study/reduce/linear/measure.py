@@ -22,7 +22,7 @@ from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, tra
 from softgrasp.reduction.propagator import Propagator
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
 from softgrasp.study.pictures.background import forked
-from softgrasp.study.reduce.linear.bases import Made, bases_of, made_apart
+from softgrasp.study.reduce.linear.bases import Made, bases_of, made_apart, small, two_shares
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
     LARGER,
@@ -195,7 +195,7 @@ def sweep_all(
 ) -> tuple[MethodSweep, ...]:
     """Every method at all N of the options, None for those of the scene. Collective.
 
-    On one rank with a free core a forked process measures every other method whose bases are made. Times are taken
+    On one rank with a free core a forked process makes and measures the bases of some of the methods. Times are taken
     afterwards, by one process at a time.
     """
     options = options or full.model.scene.reduction
@@ -204,14 +204,14 @@ def sweep_all(
     with suppress(BasisError):  # each method states what is wrong with the snapshots
         states = condensed(every)
     made = made_apart([(name, options.N) for name in names], states, options)
-    beside = [name for name in names if name in made][1::2]
+    own, beside = two_shares(names) if len(names) > 1 and small(states) else (list(names), [])
 
     def one(name: str, tell: Say) -> Untimed:
         def progress(done: int, of: int) -> None:
             tell(name, size * names.index(name) + size * done // of, size * len(names))
 
-        own = states if name in registry.METHODS else every  # a user's basis may need the columns in time
-        return untimed(name, full, options, progress, made.pop(name, None), own)
+        used = states if name in registry.METHODS else every  # a user's basis may need the columns in time
+        return untimed(name, full, options, progress, made.pop(name, None), used)
 
     def share(pause: Callable[[], None]) -> list[MethodSweep]:
         halves = [one(name, lambda what, done, of: None) for name in beside]
@@ -221,10 +221,8 @@ def sweep_all(
     other = forked(share, (full.model.system.layout, *map(registry.find_method, beside))) if beside else None
     if other is None:
         return tuple(one(name, say).timed(full) for name in names)
-    for name in beside:
-        del made[name]  # the other process has them
     with other:
-        halves = [one(name, say) for name in names if name not in beside]
+        halves = [one(name, say) for name in own]
         try:
             other.wait()
             sweeps = [half.timed(full) for half in halves] + other.result()
