@@ -6,7 +6,8 @@ of the views of the largest model of a family, and snapshots X = Q C + rest,
     |X - V Y|_F^2 = |rest|_F^2 + |C - R Y|_F^2
 
 for every model whose columns lie in the span of Q: no cancellation, and the snapshots are read once for all views and
-sizes of a family, and for all families that :func:`prepare` is given together.
+sizes of a family, and for all families that :func:`prepare` is given together. Of a run whose snapshots are condensed,
+X = X_r W' (:mod:`softgrasp.reduction.bases.condense`), the few columns X_r are read instead.
 """
 
 from __future__ import annotations
