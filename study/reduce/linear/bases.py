@@ -76,7 +76,7 @@ def made_apart(tasks: Sequence[tuple[str, list[int]]], states: States, options: 
 def small(states: States) -> bool:
     """Whether there are snapshots, and so few that each rank or process may hold all that is made of them."""
     size = sum(16 * states.layout.n_e * snapshots.Z.shape[1] for _, snapshots in states.runs)
-    return 0 < size <= WHOLE_BYTES
+    return bool(0 < size <= WHOLE_BYTES)
 
 
 def two_shares(names: Sequence[str]) -> tuple[list[str], list[str]]:

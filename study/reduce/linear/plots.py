@@ -54,8 +54,8 @@ STRETCH = 0.15  # largest displacement of a drawn mode over the size of the body
 OUTLINE: dict[str, Any] = {"color": style.ORANGE, "linewidth": 1.1}
 
 
-def draw(out: Path, sweeps: Sequence[MethodSweep], full: float, views: Views | None) -> list[Path]:
-    """All figures; ``full`` are the seconds of the full model's steps. Rank 0 only."""
+def draw_errors(out: Path, sweeps: Sequence[MethodSweep], full: float) -> list[Path]:
+    """Figures of errors, times and singular values; ``full`` are the seconds of the full model's steps. Rank 0 only."""
     files: list[Path] = []
     shown = [s for s in sweeps if s.points]
     if paper := of_paper(shown):
@@ -66,6 +66,12 @@ def draw(out: Path, sweeps: Sequence[MethodSweep], full: float, views: Views | N
     if shown:
         files += figure_times(shown, full, out / "times.png")
         files += figure_sigma(shown, out / "sigma.png")
+    return files
+
+
+def draw_bodies(out: Path, views: Views | None) -> list[Path]:
+    """Figures of modes and moves on the body. Rank 0 only."""
+    files: list[Path] = []
     if views is not None and views.modes:
         files += figure_modes(views, out / "modes.png")
     if views is not None and views.reduced:
