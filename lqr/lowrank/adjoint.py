@@ -113,9 +113,12 @@ def _solve_small(A: Complex, B: Complex) -> Complex:
     return np.asarray(X)
 
 
-def adjoint_rhs(plant: Plant, tissue: ShiftedTissue, block: Block) -> AdjointRhs:
-    """Add a = K_ee^{-1} W_z: one factorisation and solve. Collective."""
-    a = tissue.solve(0.0, block.tall[: plant.n_local])
+def adjoint_rhs(plant: Plant, tissue: ShiftedTissue, block: Block, ahead: Sequence[complex] = ()) -> AdjointRhs:
+    """Add a = K_ee^{-1} W_z: one factorisation and solve. Collective.
+
+    ``ahead``: shifts that come next.
+    """
+    a = tissue.solve(0.0, block.tall[: plant.n_local], ahead)
     return AdjointRhs(block.hand, np.vstack([block.tall, a.real]))
 
 

@@ -164,10 +164,10 @@ class NewtonADI(LowRankSolver[ModalStart]):
 
     def iterate(self, plant: Plant, tissue: ShiftedTissue, start: ModalStart) -> Iterate:
         """Newton steps until the Riccati residual is small. Collective."""
-        right = adjoint_rhs(plant, tissue, Block.join([plant.outputs(), start.gain]))
+        first = ShiftQueue.start(shift_range(plant, start.poles), start.poles)
+        right = adjoint_rhs(plant, tissue, Block.join([plant.outputs(), start.gain]), first.pending)
         p = plant.C_s.shape[0]
         outputs, state = right[:p], Iteration(right[p:])
-        first = ShiftQueue.start(shift_range(plant, start.poles), start.poles)
         shifts = list(first.pending)
         sweep: AdiSweep | None = load_state(self.checkpoint, plant, state, self.tol) if self.checkpoint else None
         while True:

@@ -85,10 +85,10 @@ class RADI(LowRankSolver[ModalStart]):
 
     def iterate(self, plant: Plant, tissue: ShiftedTissue, start: ModalStart) -> Iterate:
         """Steps until the residual is small. Collective."""
-        W = adjoint_rhs(plant, tissue, plant.outputs())
+        queue = ShiftQueue.start(shift_range(plant, start.poles), start.poles)
+        W = adjoint_rhs(plant, tissue, plant.outputs(), queue.pending)
         gain = AdjointRhs(np.zeros((len(W.hand), plant.inputs)), np.zeros((len(W.tall), plant.inputs)))
         sweep = LowRankSweep(AdjointRhs.join([gain, W]), FactorColumns(plant, SHARE * self.tol * plant.scale))
-        queue = ShiftQueue.start(shift_range(plant, start.poles), start.poles)
         relative, history = 1.0, list[dict[str, float]]()
         while sweep.steps < self.max_iterations and relative <= GROWTH:
             s = radi_step(plant, tissue, sweep, queue)

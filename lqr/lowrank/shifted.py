@@ -35,6 +35,8 @@ AHEAD_FROM = 5_000  # n_e from which other cores, if there are, make the next fa
 # Threads that do: two in 2D, where this rank would wait for one. Up to four factors are then alive at a time, too much
 # memory in 3D.
 THREADS = {1: 2, 2: 2, 3: 1}
+Factors = dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]]
+"""By shift: the rank that has the factor, and there the factor."""
 _SYMMETRIC = {"SymmetricMode": True, "Equil": False}
 
 
@@ -123,8 +125,7 @@ class GatheredTissue(ShiftedTissue):
         )
         thin = layout.dimension < 3 and layout.n_e <= THIN_UP_TO
         self.blocking = {"panel_size": 1, "relax": 16} if thin else {}
-        # factors by shift: rank that has it, and there the factor
-        self.cache: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]] = {}
+        self.cache: Factors = {}
         self.ahead: FactorsAhead | None = None
         threads = THREADS[layout.dimension]
         if MPI.COMM_WORLD.size == 1 and layout.n_e >= AHEAD_FROM and _cores() > 1:
@@ -165,24 +166,13 @@ class GatheredTissue(ShiftedTissue):
             raise SolverError(f"the factorisation of S(p) failed at the shift p = {p:.4g} ({error})") from error
 
     def _factor(self, shifts: list[complex]) -> None:
-        """One shift a rank, unless the first is there. Collective."""
+        """That of the first shift, unless it is there. On one rank."""
         if shifts[0] in self.cache:
             return
         distinct = list(dict.fromkeys(shifts))
-        shifts = distinct[: self.comm.size]
-        if self.comm.size == 1:
-            self._forget()
-            self.cache[shifts[0]] = (0, self._make(shifts[0]) if self.ahead is None else self.ahead.take(distinct))
-        else:
-            self.cache = {}
-            fresh: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]]
-            fresh = {p: (rank, None) for rank, p in enumerate(shifts)}
-            with raise_on_all_ranks(self.comm):
-                if self.comm.rank < len(shifts):
-                    p = shifts[self.comm.rank]
-                    fresh[p] = (self.comm.rank, self._make(p))
-            self.cache = fresh
-        self.factors += len(shifts)
+        self._forget()
+        self.cache[shifts[0]] = (0, self._make(shifts[0]) if self.ahead is None else self.ahead.take(distinct))
+        self.factors += 1
 
     def _forget(self) -> None:
         """Empty the cache; a factor is freed in the thread that made it."""
@@ -201,24 +191,50 @@ class GatheredTissue(ShiftedTissue):
         return next((i for i, (p, q) in enumerate(zip(first, shifts, strict=False)) if p != q), len(first))
 
     def _solve_each(self, shifts: Sequence[complex], rights: Sequence[Array | Complex]) -> list[Complex]:
-        """On several ranks: rows to the owners of the factors, solves there, rows back. Collective."""
+        """That with the one factor. On one rank."""
+        ((p,), (F,)) = shifts, rights
+        return [_lu_solve(self.cache[p][1], F, self.order, p.imag == 0)]
+
+    def solve_each(
+        self, shifts: Sequence[complex], rights: Sequence[Array | Complex], ahead: Sequence[complex] = ()
+    ) -> list[Complex]:
+        """On several ranks: rows to those that have the factors or will make them, factors and solves there, rows back.
+
+        Ranks wait for each other once a call, after their factors and solves. See the base class. Collective.
+        """
         if self.comm.size == 1:
-            ((p,), (F,)) = shifts, rights
-            return [_lu_solve(self.cache[p][1], F, self.order, p.imag == 0)]
+            return super().solve_each(shifts, rights, ahead)
+        begin = time.perf_counter()
+        known: Factors = self.cache
+        if shifts[0] not in known:  # one new factor a rank
+            distinct = list(dict.fromkeys([*shifts, *map(complex, ahead)]))[: self.comm.size]
+            known = {p: (rank, None) for rank, p in enumerate(distinct)}
+            self.cache = {}
+            self.factors += len(distinct)
         whole: dict[int, Complex] = {}
         for i, (p, F) in enumerate(zip(shifts, rights, strict=True)):
-            k, owner = F.shape[1], self.cache[p][0]
+            k, owner = F.shape[1], known[p][0]
             if self.comm.rank == owner:
                 whole[i] = np.empty((int(self.counts.sum()), k), dtype=complex)
             rows = [whole[i], self.counts * k] if i in whole else None
             self.comm.Gatherv(np.ascontiguousarray(F, dtype=complex), rows, root=owner)
-        for i, F in whole.items():
-            p = shifts[i]
-            whole[i] = np.ascontiguousarray(_lu_solve(self.cache[p][1], F, self.order, p.imag == 0))
+        middle = time.perf_counter()
+        factoring = 0.0
+        with raise_on_all_ranks(self.comm):
+            for p, (rank, factor) in known.items():
+                if rank == self.comm.rank and factor is None:
+                    known[p] = rank, self._make(p)
+            factoring = time.perf_counter() - middle
+            for i, F in whole.items():
+                p = shifts[i]
+                whole[i] = np.ascontiguousarray(_lu_solve(known[p][1], F, self.order, p.imag == 0))
+        self.cache = known
         results = [np.empty(F.shape, dtype=complex) for F in rights]
         for i, (p, result) in enumerate(zip(shifts, results, strict=True)):
             rows = [whole[i], self.counts * result.shape[1]] if i in whole else None
-            self.comm.Scatterv(rows, result, root=self.cache[p][0])
+            self.comm.Scatterv(rows, result, root=known[p][0])
+        self.seconds["factor"] += factoring
+        self.seconds["solve"] += time.perf_counter() - begin - factoring
         return results
 
     def destroy(self) -> None:

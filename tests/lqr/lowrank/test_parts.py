@@ -9,6 +9,7 @@ import psutil
 import pytest
 from mpi4py import MPI
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.scene.file import load_scene
@@ -253,6 +254,29 @@ def test_symmetric_sparse_copy_is_the_matrix() -> None:
     for A in (system.K_ee, system.M_ee, system.damping.matrix):
         whole = gather_matrix(system.layout, A)
         assert abs(whole - whole.T).max() < 1e-12 * abs(whole).max()  # order of summation in assembly
+
+
+@pytest.mark.ranks
+def test_a_factor_that_fails_on_one_rank_ends_the_solve_on_all(
+    comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ranks factor and solve before they wait for each other; what was there before is not used again."""
+    tissue, shifts = GatheredTissue(problem_of("one_way").system), [complex(-1.0 - i, 2.0) for i in range(comm.size)]
+    F, make = np.ones((tissue.n_local, 2)), GatheredTissue._make
+    expected = [tissue.solve(p, F) for p in shifts]
+
+    def refused(self: GatheredTissue, p: complex, shell: int = 0) -> Any:
+        if p == shifts[-1]:
+            raise SolverError("the factorisation of S(p) failed")
+        return make(self, p, shell)
+
+    tissue.solve(-3.0 + 9j, F)
+    with monkeypatch.context() as patch:
+        patch.setattr(GatheredTissue, "_make", refused)
+        with pytest.raises(SolverError, match="failed"):
+            tissue.solve_each(shifts, [F] * len(shifts))
+    for one, other in zip(tissue.solve_each(shifts, [F] * len(shifts)), expected, strict=True):
+        assert np.array_equal(one, other)  # the same factor of the same rows
 
 
 @pytest.mark.serial
