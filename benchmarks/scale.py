@@ -20,8 +20,8 @@ from softgrasp.study.report.document import Table, number
 from softgrasp.study.shell.timing import power_law
 
 SIZES = (
-    "2d1:10000,2d1:30000,2d1:100000,2d1:400000,2d2:30000,2d2:100000,3d1:7000,3d1:21000,3d1:68000,3d2:8000,3d2:21000,"
-    "3d2:68000,3d2:21000:stars,3d2:68000:stars,3d2:198000:stars"
+    "2d1:10000,2d1:30000,2d1:100000,2d1:400000,2d2:30000,2d2:100000,3d1:7000,3d1:21000,3d1:68000,3d2:8000,3d2:21000:mumps,"
+    "3d2:68000:mumps,3d2:21000:stars,3d2:68000:stars,3d2:198000:stars"
 )
 WEAK = "3d2:21000:stars"
 PATTERN = r"([23]d[123]):(\d+)(?::(cholesky|mumps|cg|stars))?"

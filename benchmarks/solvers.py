@@ -15,7 +15,7 @@ from mpi4py import MPI
 from benchmarks.driver import cpu_seconds
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.midpoint import midpoint_matrix
-from softgrasp.fem.solve.costs import FEW_SOLVES, GUESSED, ITERATIVE, SolverName, Work
+from softgrasp.fem.solve.costs import FEW_SOLVES, ITERATIVE, SolverName, Work
 from softgrasp.fem.solve.solvers import TissueSolver, make_solver
 from softgrasp.fem.system import dynamic_stiffness
 from softgrasp.study.report.document import number
@@ -84,7 +84,7 @@ def measure(kind: str, order: int, model: Model) -> Iterator[Row]:
             count, share = 0, 1.0
             if name in ITERATIVE:
                 count = int(solver.ksp.getIterationNumber())
-                share = 1.0 if few else GUESSED[name]
+                share = 1.0 if few else work.share(name)
             solver.destroy()
             ratios = setup / work.setup(name), share * solve / work.solve(name)
             total = setup + solves * share * solve

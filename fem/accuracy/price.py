@@ -20,7 +20,7 @@ from softgrasp.fem.solve.costs import BUILD, ENTRIES, FEW_SOLVES, Work
 
 SHARE = 0.3  # of a run's work that an estimate may need without --certify
 PRODUCTS = 4  # with a column of a Krylov model, for its inner products
-STARS = {2: 3e-5, 3: 1.2e-4, 4: 4e-4}  # [s] an unknown to set up stars, by order
+STARS = {2: 2e-5, 3: 4.5e-5, 4: 1.3e-4}  # [s] an unknown to set up stars, by order
 STARS_ENTRY = 6.5e-9  # [s] of an entry in an iteration with them
 MOST_STARS = 1_200_000  # unknowns whose stars fit into the memory of a node
 COARSER = (0.8, 2 / 3, 0.5)  # cells a side of a box that is estimated instead, over those of the mesh

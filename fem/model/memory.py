@@ -97,11 +97,20 @@ def steps_of(scene: Scene, n: int, dimension: int, ranks: int) -> Work:
     contrast = max(m.lam / m.mu for m in materials)
     time = scene.time
     refine, damped = scene.tissue.refine, scene.effects.damping is not None
-    graded = refine is not None and refine.grading != "off"
+    graded = _flat_cells(scene) or (refine is not None and refine.grading != "off")
     order, bits = scene.tissue.order, time.reproducible
     effects = scene.effects
     linear = effects.finite_strain is None and effects.frame is None and not effects.obstacles
-    return Work(n, dimension, order, ranks, time.steps, False, contrast, bits, graded, damped, linear)
+    return Work(n, dimension, order, ranks, time.steps, False, contrast, bits, graded, damped, linear, not linear)
+
+
+def _flat_cells(scene: Scene) -> bool:
+    """Whether cells of a box have edges of a ratio above 2, or those of another mesh may have, as graded ones do."""
+    size, cells = scene.tissue.size, scene.tissue.cells
+    if size is None or cells is None:
+        return True
+    edges = [w / n for w, n in zip(size, cells, strict=True)]
+    return max(edges) > 2 * min(edges)
 
 
 def solver_memory(scene: Scene, n: float, dimension: int) -> float:

@@ -22,10 +22,13 @@ Power = tuple[float, float]  # value at 1e5 unknowns, and exponent of the number
 # Relative residual at which a step ends [1]. Smooth errors weigh little in the residual of a stiff matrix: of 276
 # random linear scenes cg left up to 3.6e-2 of the deformation at 1e-4, 9.3e-7 at 1e-8.
 STEP_RTOL = {"cg": 1e-8, "stars": 1e-4}
-# Iterations of a step from the last solutions, over those from zero to 1e-8 [1].
-GUESSED = {"cg": 0.6, "stars": 0.3}
+# Iterations of a step from the last solutions over those from zero to 1e-8, a / (1 + N / b) with N steps of a motion,
+# by solver and whether steps are damped [1]: measured at N = 20, 50, 200 and 600, to 1.4.
+GUESSED = {("cg", False): (0.8, 300), ("cg", True): (0.55, 250),
+           ("stars", False): (0.32, 1000), ("stars", True): (0.22, 90)}  # fmt: skip
+# Unknowns from which what iterates is a candidate: smaller ones were not measured, and a factor leaves more digits.
+ITERATED_FROM = 20_000
 GRADED = 2.5  # iterations on lines that crowd over those on even cells [1]: cg 2.2 to 2.6, stars 2.8
-DAMPED = 0.5  # share of these iterations that damped steps need, for their last solutions predict the next better [1]
 FEW_SOLVES = 20  # solves of equilibrium, mesh estimate or modes with one factor, and of all where it is shared [1]
 UNKNOWN = 1e8  # contrast of matrices whose iterations the model does not know: a factor, while one is a candidate [1]
 PARALLEL = 0.62  # exponent p of the time ranks^-p of a factor spread over ranks [1]: 0.65 on two ranks, measured
@@ -64,25 +67,25 @@ class Cost:
 # By solver, dimension and the order from which it holds. Messages of iterations are counted on 2 to 8 ranks, those of
 # a factor guessed. Times of direct solvers follow their entries: n log n and n^1.5 in 2D, n^(4/3) and n^2 in 3D, but
 # for the caches; memory of factors is nnz(L) of factor_bytes. With 1e6 unknowns in 2D cholesky takes 20 s and 0.19 s,
-# MUMPS 11 s and 0.37 s, and both the same memory; beyond it was not measured. What iterates on P3 was measured at 9e3
-# and 2e4 unknowns, where factors take the time of P2 to 1.2; its memory follows the entries.
+# MUMPS 11 s and 0.37 s, and both the same memory; beyond it was not measured. Stars were measured from 2e4 to
+# 3.2e5 unknowns of P2 and with 2e4 and 7e4 of P3, cg of P3 with 9e3 and 2e4, where factors take the time of P2 to 1.2.
 COSTS: dict[tuple[SolverName, int, int], Cost] = {
     ("cholesky", 2, 1): Cost((0.6, 1.5), (0.0125, 1.18), (800, 0.1), 1.2e6),
     ("cholesky", 2, 2): Cost((0.57, 1.5), (0.0138, 1.12), (1000, 0.1), 1.2e6),
     ("mumps", 2, 1): Cost((0.5, 1.33), (0.029, 1.1), (1000, 0.1), 4e6, fixed=0.033, messages=100),
     ("mumps", 2, 2): Cost((0.6, 1.28), (0.0275, 1.07), (1250, 0.1), 4e6, fixed=0.033, messages=100),
-    ("cg", 2, 1): Cost((0.25, 1.0), (0.006, 1.12), (600, 0.0), np.inf, iterations=(9, 9.6), messages=22),
+    ("cg", 2, 1): Cost((0.3, 1.12), (0.0105, 1.15), (600, 0.0), np.inf, iterations=(9, 9.6), messages=22),
     ("cg", 2, 2): Cost((0.6, 1.0), (0.02, 1.0), (1000, 0.0), np.inf, iterations=(16, 16), messages=22),
-    ("stars", 2, 2): Cost((1.2, 1.0), (0.02, 1.0), (900, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
+    ("stars", 2, 2): Cost((0.7, 1.0), (0.021, 1.0), (900, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
     ("cholesky", 3, 1): Cost((37.0, 2.0), (0.11, 1.5), (13_000, 1 / 3), 2e4),
     ("cholesky", 3, 2): Cost((37.0, 2.0), (0.11, 1.5), (13_000, 1 / 3), 2e4),
     ("mumps", 3, 1): Cost((13.1, 2.0), (0.158, 1.5), (10_600, 1 / 3), 3e5, fixed=0.033, messages=100),
     ("mumps", 3, 2): Cost((12.8, 2.0), (0.144, 4 / 3), (10_600, 1 / 3), 3e5, fixed=0.033, messages=100),
-    ("cg", 3, 1): Cost((0.8, 1.0), (0.022, 1.0), (900, 0.0), np.inf, iterations=(9, 9.6), messages=22),
-    ("cg", 3, 2): Cost((2.0, 1.0), (0.080, 1.0), (700, 0.0), np.inf, iterations=(16, 16), messages=22),
-    ("stars", 3, 2): Cost((2.8, 1.17), (0.044, 1.2), (3200, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
+    ("cg", 3, 1): Cost((1.6, 1.15), (0.029, 1.15), (900, 0.0), np.inf, iterations=(9, 9.6), messages=22),
+    ("cg", 3, 2): Cost((2.4, 1.22), (0.058, 1.2), (1200, 0.0), np.inf, iterations=(16, 16), messages=22),
+    ("stars", 3, 2): Cost((1.3, 1.2), (0.040, 1.17), (2600, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
     ("cg", 3, 3): Cost((2.0, 1.0), (0.06, 1.0), (1100, 0.0), np.inf, iterations=(16, 27), messages=22),
-    ("stars", 3, 3): Cost((15.0, 1.2), (0.15, 1.15), (6500, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
+    ("stars", 3, 3): Cost((4.0, 1.05), (0.084, 1.08), (6500, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
 }
 
 
@@ -101,6 +104,7 @@ class Work:
     graded: bool = False  # whether cells crowd, so that they are flat and iterations more
     damped: bool = False  # whether steps are damped, so that the last solutions predict the next better
     linear: bool = False  # whether they are linear steps without contact, whose factor may have a subtree on each rank
+    direct: bool = False  # whether steps need a factor while one is a candidate, of contact or a nonlinear law
 
     def repeated(self, name: SolverName) -> bool:
         """Whether every rank factors by itself: no message in a solve, and the same bits in every run.
@@ -140,9 +144,15 @@ class Work:
         """Modelled time of one solve [s]."""
         passes = 1.0
         if name in ITERATIVE:
-            share = GUESSED[name] * (DAMPED if self.damped else 1.0)
-            passes = self.iterations(name) * (1.5 if self.few else share)
+            passes = max(self.iterations(name) * self.share(name), 1.0)
         return passes * (self._time(self._cost(name).pass_, name) + self._waits(name))
+
+    def share(self, name: SolverName) -> float:
+        """Iterations of a solve over those from zero to 1e-8 [1]; a step begins with the last solutions."""
+        if self.few:
+            return 1.5
+        first, steps = GUESSED[name, self.damped]
+        return first / (1 + self.solves / steps)
 
     def iterations(self, name: SolverName) -> float:
         """Modelled iterations from zero to 1e-8 [1]; 1 by a factor."""
@@ -160,7 +170,9 @@ class Work:
     def candidates(self) -> list[SolverName]:
         """Solvers of these elements that are measured at this size."""
         names = dict.fromkeys(name for name, d, least in COSTS if d == self._kind and least <= self.order)
-        return [name for name in names if self.n <= self._cost(name).most]
+        fitting = [name for name in names if self.n <= self._cost(name).most]
+        factors = [name for name in fitting if name not in ITERATIVE]
+        return factors if factors and (self.direct or self.n < ITERATED_FROM) else fitting
 
     def leanest(self) -> SolverName:
         """The candidate with the least modelled memory."""

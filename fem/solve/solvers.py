@@ -60,6 +60,7 @@ def choose_solver(
     contrast: float = UNKNOWN,
     steps: int = 200,
     memory: float = np.inf,
+    direct: bool = False,
 ) -> tuple[SolverName, str]:
     """The solver of the least modelled time (`softgrasp.fem.solve.costs`) that fits, with the reason in words.
 
@@ -68,8 +69,9 @@ def choose_solver(
         contrast: largest lambda / mu, which iterations grow with; not known: a factor while one is a candidate.
         steps: of the run.
         memory: that set-up and factor may use, over all ranks [byte].
+        direct: a factor while one is a candidate.
     """
-    work = work_of(layout, FEW_SOLVES if few else steps, few, contrast)
+    work = replace(work_of(layout, FEW_SOLVES if few else steps, few, contrast), direct=direct)
     return work.solver(requested, memory), work.reason(requested, memory)
 
 
