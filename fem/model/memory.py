@@ -101,7 +101,8 @@ def steps_of(scene: Scene, n: int, dimension: int, ranks: int) -> Work:
     order, bits = scene.tissue.order, time.reproducible
     effects = scene.effects
     linear = effects.finite_strain is None and effects.frame is None and not effects.obstacles
-    return Work(n, dimension, order, ranks, time.steps, False, contrast, bits, graded, damped, linear, not linear)
+    direct = not linear or bool(scene.tissue.layers)  # layers may leave larger errors at the tolerance of stars
+    return Work(n, dimension, order, ranks, time.steps, False, contrast, bits, graded, damped, linear, direct)
 
 
 def _flat_cells(scene: Scene) -> bool:

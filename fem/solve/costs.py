@@ -104,7 +104,7 @@ class Work:
     graded: bool = False  # whether cells crowd, so that they are flat and iterations more
     damped: bool = False  # whether steps are damped, so that the last solutions predict the next better
     linear: bool = False  # whether they are linear steps without contact, whose factor may have a subtree on each rank
-    direct: bool = False  # whether steps need a factor while one is a candidate, of contact or a nonlinear law
+    direct: bool = False  # whether a factor is used while one is a candidate: contact, nonlinear laws, layers
 
     def repeated(self, name: SolverName) -> bool:
         """Whether every rank factors by itself: no message in a solve, and the same bits in every run.
