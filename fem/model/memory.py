@@ -91,7 +91,7 @@ def chosen(scene: Scene, work: Work) -> tuple[SolverName, str]:
     return name, work.reason(requested, limit) + work.price_of_bits(name)
 
 
-def steps_of(scene: Scene, n: int, dimension: int, ranks: int) -> Work:
+def steps_of(scene: Scene, n: float, dimension: int, ranks: int) -> Work:
     """The solves of the steps of a scene with n unknowns."""
     materials = [scene.tissue.material, *(layer.material for layer in scene.tissue.layers.values())]
     contrast = max(m.lam / m.mu for m in materials)

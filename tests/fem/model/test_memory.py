@@ -16,10 +16,12 @@ from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import box_simplices, check_memory, chosen, free_bytes, need, steps_of
+from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.strain.body import HyperelasticBody
 from tests.helpers.models import CUBE, make_scene
 
 GIB = 2.0**30
+EVEN = ["tissue.order=2", "tissue.refine=false", "tissue.cells=[16, 12, 32]"]
 
 
 @pytest.fixture
@@ -141,6 +143,21 @@ def test_memory_that_is_freed_stays_for_a_while() -> None:
     with resources.kept_memory():
         assert faults() < 80  # one block's, and a few pages
     assert faults() > 200
+
+
+@pytest.mark.parametrize(
+    ("name", "keys"),
+    [
+        ("set_down_3d", ["tissue.order=2"]),
+        ("block_3d", [*EVEN, "effects.finite_strain={}", "effects.rotation=false"]),
+        ("block_3d", [*EVEN, "tissue.layers.low={box=[[0,0,0],[0.1,0.1,0.01]], material='ecoflex-00-30'}"]),
+    ],
+)
+def test_contact_nonlinear_laws_and_layers_have_a_factor(name: str, keys: list[str]) -> None:
+    """Contact is refused without one, which was the choice at nu = 0.3."""
+    even, work = steps_of(load_scene("block_3d", EVEN), 1e5, 3, 1), steps_of(load_scene(name, keys), 1e5, 3, 1)
+    assert not {"cg", "stars"} & set(work.candidates())
+    assert even.choose()[0] == "stars"
 
 
 @pytest.mark.parametrize("order", [1, 2])
