@@ -149,7 +149,7 @@ def test_memory_that_is_freed_stays_for_a_while() -> None:
     ("name", "keys"),
     [
         ("set_down_3d", ["tissue.order=2"]),
-        ("block_3d", [*EVEN, "effects.finite_strain={}", "effects.rotation=false"]),
+        ("turn_over", []),
         ("block_3d", [*EVEN, "tissue.layers.low={box=[[0,0,0],[0.1,0.1,0.01]], material='ecoflex-00-30'}"]),
     ],
 )
