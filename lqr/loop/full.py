@@ -160,7 +160,8 @@ class ClosedLoop:
         if not (np.isfinite(dt) and dt > 0):
             raise ControlError(f"dt = {dt} s must be a positive number")
         self.problem, self.dt, self.scene = problem, dt, scene
-        name, reason = choose_solver(problem.layout, solver, direct=True)  # its responses are columns of a factor
+        # its responses are columns of a factor
+        name, reason = choose_solver(problem.layout, solver, contrast=problem.system.contrast, direct=True)
         begin = time.perf_counter()
         self.midpoint = make_midpoint(problem.system, dt, name, rtol, reproducible, scene is not None)
         self.solver = self.midpoint.solver.used(reason)
