@@ -24,6 +24,7 @@ from softgrasp.reduction.certified.greedy import REASONS, Greedy, GreedyStep, gr
 from softgrasp.reduction.certified.model import CertifiedModel, ParameterDomain
 from softgrasp.reduction.certified.motion import Materials
 from softgrasp.reduction.certified.residual import ResidualSpace
+from softgrasp.reduction.certified.shared import TwoProcesses
 from softgrasp.reduction.certified.training import certified_model, scene_drive
 from softgrasp.reduction.certified.validation import measured_error
 from softgrasp.reduction.parameters import box_of, materials_at, outside, run_with, thinned
@@ -124,6 +125,7 @@ class Trainer:
         self.reference = materials_at(model, float(np.sqrt(lam[0] * lam[1])), float(np.sqrt(mu[0] * mu[1])))
         self.space = ResidualSpace(model.system, self.reference)
         self.drives = [scene_drive(m.scene, m.system.M_hand, 1) for m in self.models]
+        self._shared = TwoProcesses(self._own_bounds)
         self.Phi = np.zeros((model.system.layout.n_local, 0))
         self._runs: dict[int, list[Array]] = {}
         self.full_runs, self.added = 0, list[int]()
@@ -207,16 +209,19 @@ class Trainer:
         return self.bounds_at([self.parameters[i] for i in indices], self.certified)
 
     def bounds_at(self, many: Sequence[Materials], model: CertifiedModel) -> list[float]:
-        """The same at any materials and for any model; the ranks share the work. Collective."""
-        local, values = many[self.comm.rank :: self.comm.size], np.zeros(len(many))
-        for drive in self.drives if local else ():
-            own = np.array([certificate.reduction for certificate in model.certificates(local, drive)])
-            share = values[self.comm.rank :: self.comm.size]
-            np.maximum(share, own, out=share)
-        parts = self.comm.allgather(values[self.comm.rank :: self.comm.size])
+        """The same at any materials and for any model; the ranks, or two processes, share the work. Collective."""
+        values = np.zeros(len(many))
+        parts = self.comm.allgather(self._shared(many[self.comm.rank :: self.comm.size], model))
         for rank, part in enumerate(parts):
             values[rank :: self.comm.size] = part
-        return [float(value) for value in values]
+        return values.tolist()
+
+    def _own_bounds(self, many: Sequence[Materials], model: CertifiedModel) -> list[float]:
+        values = np.zeros(len(many))
+        for drive in self.drives if many else ():
+            own = np.array([certificate.reduction for certificate in model.certificates(many, drive)])
+            np.maximum(values, own, out=values)
+        return values.tolist()
 
     def add(self, i: int) -> None:
         """Make one of the random parameters a point of the training."""
@@ -238,6 +243,7 @@ class Trainer:
 
     def destroy(self) -> None:
         """Free the factors. Collective."""
+        self._shared.end()
         self.space.destroy()
 
 

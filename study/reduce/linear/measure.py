@@ -13,6 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem import Reduction, Scene
+from softgrasp.fem.forked import Pause, forked
 from softgrasp.reduction import Basis, ModelComparison, ModelError, ReducedModel, project_scene, registry
 from softgrasp.reduction.bases.condense import condensed
 from softgrasp.reduction.bases.states import BasisError, States, states_of
@@ -21,7 +22,6 @@ from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.propagator import Propagator
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
-from softgrasp.study.pictures.background import forked
 from softgrasp.study.reduce.linear.bases import Made, bases_of, made_apart, small, two_shares
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
@@ -213,9 +213,9 @@ def sweep_all(
         used = states if name in registry.METHODS else every  # a user's basis may need the columns in time
         return untimed(name, full, options, progress, made.pop(name, None), used)
 
-    def share(pause: Callable[[], None]) -> list[MethodSweep]:
+    def share(pause: Pause) -> list[MethodSweep]:
         halves = [one(name, lambda what, done, of: None) for name in beside]
-        pause()
+        pause(None)
         return [half.timed(full) for half in halves]
 
     other = forked(share, (full.model.system.layout, *map(registry.find_method, beside))) if beside else None

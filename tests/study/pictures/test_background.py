@@ -6,15 +6,15 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from mpi4py import MPI
 
+from softgrasp.fem import forked as beside
 from softgrasp.fem.errors import SceneError
-from softgrasp.study.pictures import background
-from softgrasp.study.pictures.background import draw_in_background, forked
+from softgrasp.fem.forked import Pause, forked
+from softgrasp.study.pictures.background import draw_in_background
 
 HERE = os.getpid()
 COMM = MPI.COMM_WORLD
@@ -56,7 +56,7 @@ def test_errors_come_back_and_a_lost_process_is_replaced(tmp_path: Path) -> None
 @pytest.mark.serial
 def test_a_process_that_stands_still_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A lock that another thread had at the fork is never freed; one that computes is waited for."""
-    monkeypatch.setattr(background, "PATIENCE", 0.2)
+    monkeypatch.setattr(beside, "PATIENCE", 0.2)
     lock = threading.Lock()
 
     def waits(out: Path) -> list[Path]:
@@ -75,7 +75,7 @@ def test_a_process_that_stands_still_is_given_up(tmp_path: Path, monkeypatch: py
             pass
         return draw(out)
 
-    monkeypatch.setattr(background, "PATIENCE", 1.0)  # a loaded machine gives it a hundredth of that
+    monkeypatch.setattr(beside, "PATIENCE", 1.0)  # a loaded machine gives it a hundredth of that
     files = draw_in_background(COMM, tmp_path, computes)
     assert files() == [tmp_path / "drawn.png"]
     assert (tmp_path / "drawn.png").read_text() != str(HERE) or len(os.sched_getaffinity(0)) == 1
@@ -87,16 +87,17 @@ def test_a_call_that_pauses_goes_on_when_it_is_asked_for(tmp_path: Path) -> None
     """So that the times of either process are taken while the other one does nothing."""
     same = object()
 
-    def works(pause: Callable[[], None]) -> tuple[float, object]:
-        pause()
+    def works(pause: Pause) -> tuple[float, object]:
+        assert pause(3) == "on"
         return time.monotonic(), same
 
     other = forked(works, (same,))
     assert other is not None
     with other:
-        other.wait()
+        assert other.wait() == 3
         time.sleep(0.1)
         asked = time.monotonic()
+        other.go_on("on")
         went_on, back = other.result()
     assert went_on >= asked
     assert back is same
