@@ -9,7 +9,7 @@ from softgrasp.fem.forked import Forked, Pause, forked
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.motion import Materials
 
-PAYS = 0.03  # [s] of bounds from which a process is started: a fork, and copies of the pages that are written after it
+PAYS = 0.05  # [s] of bounds from which a process is started: a fork, and copies of the pages that are written after it
 
 Bounds = Callable[[Sequence[Materials], CertifiedModel], list[float]]
 

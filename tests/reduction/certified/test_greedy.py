@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,6 +14,7 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import times_columns, total
+from softgrasp.reduction.certified import shared
 from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.reduction.certified.greedy import Greedy, greedy, start
 from softgrasp.reduction.certified.trainer import (
@@ -218,3 +220,33 @@ def test_rounding_adds_no_modes() -> None:
     trainer.destroy()
     assert certified.training["reason"] == "exhausted"
     assert certified.run(allow=True).certificate.reduction < 1e-9  # the bound at rounding
+
+
+@pytest.mark.serial
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) == 1, reason="one core has no other process")
+def test_bounds_by_two_processes_are_those_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same bits, for even and odd numbers of parameters and another model; a lost process has no follower."""
+    monkeypatch.setattr(shared, "PAYS", 0.0)
+    _, trainer, certified = trained(MPI.COMM_SELF, 0.3)
+    here, asked = os.getpid(), list[int]()
+
+    def counted(many: Any, model: Any) -> list[float]:
+        if os.getpid() == here:
+            asked.append(len(many))
+        return trainer._own_bounds(many, model)
+
+    two, many = shared.TwoProcesses(counted), trainer.parameters
+    smaller = replace(certified, k=certified.k - 1, certify="two")
+    alone = {id(model): trainer._own_bounds(many, model) for model in (certified, smaller)}
+    assert two(many, certified) == alone[id(certified)]  # nothing is known of the times yet
+    for model, count in ((certified, 25), (certified, 8), (smaller, 9)):
+        assert two(many[:count], model) == alone[id(model)][:count]
+    assert asked == [25, 13, 4, 5]
+    assert two._other is not None
+    two._other.process.kill()
+    assert two(many, smaller) == alone[id(smaller)]
+    assert asked[-1] == 25
+    assert two(many, certified) == alone[id(certified)]
+    assert asked[-1] == 25
+    assert two._other is None
+    trainer.destroy()
