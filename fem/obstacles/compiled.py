@@ -9,8 +9,9 @@ import numpy as np
 
 from softgrasp.fem.compiled import library
 
-SOURCE = Path(__file__).with_name("contact.c")
-HEADERS = tuple(SOURCE.with_name(name) for name in ("dense.h", "flat.h", "pivots.h", "rub.h", "swept.h", "triangle.h"))
+CODE = Path(__file__).with_name("code")
+SOURCE = CODE / "contact.c"
+HEADERS = tuple(sorted(CODE.glob("*.h")))
 RIDGE = 1e-13  # share of the diagonal that makes equal rows share their force [1]
 RETRIES = 3  # rounds without progress before rows change sides one by one
 KINDS = {
@@ -33,11 +34,11 @@ def contact_library() -> Any:
 
 def friction_library() -> Any:
     """See `compiled`, of `friction.c`."""
-    return compiled(SOURCE.with_name("friction.c"), _struct("rub.h", "Rub") + RUB_DECLARATIONS)
+    return compiled(CODE / "friction.c", _struct("rub.h", "Rub") + RUB_DECLARATIONS)
 
 
 def _struct(header: str, name: str) -> str:
-    code, end = SOURCE.with_name(header).read_text(), f"}} {name};\n"
+    code, end = (CODE / header).read_text(), f"}} {name};\n"
     return code[code.index("typedef struct {") : code.index(end)] + end
 
 
@@ -50,7 +51,6 @@ void softgrasp_products(const Swept *s, int j, double *to);
 void softgrasp_combine(const Swept *s, const double *t, double *to);
 void softgrasp_values(const Flat *f, double *to);
 void softgrasp_refresh(const Flat *f);
-double softgrasp_rubbed(const Flat *f);
 int softgrasp_step(Flat *f, int n);
 int softgrasp_finish(Flat *f, int n, const double *v);
 int softgrasp_strike(Flat *f, int n, double *v);
@@ -63,4 +63,7 @@ void softgrasp_begin(Rub *f, int where, int known);
 int softgrasp_rub(Rub *f, int begin, int rounds);
 void softgrasp_sweep(Rub *f, int sweeps, double still);
 double softgrasp_wrong(Rub *f);
+int softgrasp_stays(const void *flat, const int *rows, int count);
+void softgrasp_jolt(const void *flat, const Rub *step, const int *rows, const double *A, Rub *jolt);
+int softgrasp_jolted(const void *flat, const Rub *step, const int *rows, const Rub *jolt);
 """

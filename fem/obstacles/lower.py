@@ -20,10 +20,11 @@ typedef struct {
 int softgrasp_mass(int n, const int *ptr, const int *col, const double *M, const double *inverse, int most, double rtol,
   int *order, int count, double *x, double *room, char *in);
 void softgrasp_ahead(const Lower *L, double *x);
-void softgrasp_back(const Lower *L, double *x);
+void softgrasp_back(const Lower *L, int several, int n, double *x);
 """
 GROUP = 4
 WASTE = 16
+MOST = 3  # vectors that a sweep takes at once
 
 
 class LowerFactor:
@@ -58,7 +59,7 @@ class LowerFactor:
         self.f, self.f.count = self.ffi.new("Lower *"), len(sizes)
         self.arrays: dict[str, Array] = {
             "begin": begin.astype(np.intc), "first": first.astype(np.intc), "rows": beneath.astype(np.intc),
-            "at": at.astype(np.int64), "values": values, "room": np.zeros(int(height.max())),
+            "at": at.astype(np.int64), "values": values, "room": np.zeros(int(MOST * height.max())),
         }  # fmt: skip
         for name, array in self.arrays.items():
             kind = {"i": "int[]", "l": "long[]", "d": "double[]"}[array.dtype.char]
@@ -69,8 +70,8 @@ class LowerFactor:
         self.c.softgrasp_ahead(self.f, self.ffi.from_buffer("double[]", x))
 
     def back(self, x: Array) -> None:
-        """L^-T x in place, (n,)."""
-        self.c.softgrasp_back(self.f, self.ffi.from_buffer("double[]", x))
+        """L^-T x in place, (n,), or of the rows of x (k, n), k up to 3."""
+        self.c.softgrasp_back(self.f, x.size // x.shape[-1], x.shape[-1], self.ffi.from_buffer("double[]", x))
 
 
 def _blocks(ptr: Array, rows: Array) -> Array:

@@ -8,7 +8,6 @@ of the nodes: a column decays by about a third from node to node.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,14 +16,14 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import splu
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.obstacles.compiled import compiled
+from softgrasp.fem.obstacles.compiled import CODE, compiled
 from softgrasp.fem.obstacles.lower import DECLARATION, LowerFactor
 from softgrasp.fem.obstacles.responses import TOGETHER
 from softgrasp.fem.obstacles.swept import SweptColumns
 
 Array = NDArray[Any]
 Ints = NDArray[np.intp]
-SOURCE = Path(__file__).with_name("mass.c")
+SOURCE = CODE / "mass.c"
 MOST = 1000  # rounds; about thirty are usual
 FACTORED = {2: 500_000, 3: 50_000}  # most nodes, by axes, whose mass is factored: 0.2 GB, and 0.6 while it is made
 RTOL = 1e-15  # preconditioned norm of the residual over that of the right-hand side
@@ -202,9 +201,8 @@ class SweptMass(NodalMass):
 
     def answer(self, ways: int) -> None:
         """See :meth:`NodalMass.answer`."""
-        for y, x in zip(self.given[:ways], self.found[:ways], strict=True):
-            np.divide(y, self.C, out=x)
-            self.L.back(x)
+        np.divide(self.given[:ways], self.C, out=self.found[:ways])
+        self.L.back(self.found[:ways])
 
     def respond(self, b: Array) -> Array:
         """See :meth:`NodalMass.respond`."""

@@ -171,7 +171,7 @@ class FlatContact(Contact):
             elif wanted == ENTER:
                 self._enter(np.argwhere((self.after < -f.depth) & ~self.entered))
             elif wanted == BALANCE:
-                self.point(to=self._balance(f.tol / 4))
+                self._balance(f.tol / 4)
             elif wanted == SOLVE:
                 self._solve()
             elif wanted == SWEEP:
@@ -218,9 +218,9 @@ class FlatContact(Contact):
         self.midpoint.w.axpy(1.0, self.y)
         self.responses.y[:] = 0.0
 
-    def _balance(self, tol: float) -> Array:
-        """Forces of the rows that leave no gap below -tol."""
-        return self.small.solve(self.f.k, self.W, self.free, tol)
+    def _balance(self, tol: float) -> None:
+        """Find forces of the rows that leave no gap below -tol."""
+        self.point(to=self.small.solve(self.f.k, self.W, self.free, tol))
 
     def _enter(self, pairs: Ints) -> None:
         """Give pairs of half-space and node, (m, 2), their rows in W. Collective."""

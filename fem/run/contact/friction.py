@@ -22,6 +22,7 @@ from scipy.linalg.blas import dsymv
 
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.obstacles import HalfSpace
+from softgrasp.fem.obstacles.compiled import friction_library
 from softgrasp.fem.obstacles.coulomb import Coulomb
 from softgrasp.fem.obstacles.inverse import Inverse
 from softgrasp.fem.obstacles.newton import OPEN, SLIP, STICK
@@ -213,13 +214,21 @@ class Side:
         jolt: problem of their impulses.
         stopped: rows of the last impulse, (k d,).
         A: N M^-1 N' of these rows, (k d, k d).
+        mu: coefficients of friction of their nodes, (k,).
+        forces, sets: where C finds the forces of ``coulomb`` and its sets.
+        rows, block: where it finds ``stopped`` and ``A``.
     """
 
     def __init__(self, tangents: int, inverse: Inverse) -> None:
         self.coulomb, self.jolt = Coulomb(tangents, inverse=inverse), Coulomb(tangents)
-        self.stopped, self.A = np.zeros(0, dtype=np.intp), np.zeros((0, 0))
+        self.stopped, self.A, self.mu, self.x = np.zeros(0, np.intc), np.zeros((0, 0)), np.zeros(0), np.zeros(0)
+        self.ffi, self.c = friction_library()
+        self._point()
 
-    def stop(self, rows: Ints, A: Array, other: Side) -> None:
+    def _point(self) -> None:
+        self.rows, self.block = self.ffi.from_buffer("int[]", self.stopped), self.ffi.from_buffer("double[]", self.A)
+
+    def stop(self, rows: Ints, A: Array, mu: Array, other: Side) -> None:
         """Room for impulses on other rows, of all N M^-1 N'; while they stay, their problem keeps its factor.
 
         What belongs to the rows alone is shared with the other side where its rows are the same.
@@ -228,8 +237,16 @@ class Side:
             self.A, self.jolt.inverse = other.A, other.jolt.inverse
         else:
             self.A, self.jolt.inverse = np.ascontiguousarray(A[np.ix_(rows, rows)]), Inverse()
-        self.stopped = rows
+        self.stopped, self.mu = rows.astype(np.intc), mu
+        self._point()
         self.jolt.fit(len(rows) // (1 + self.jolt.m))
+
+    def answer(self, f: Any) -> None:
+        """Let the struct of `flat.h` have the forces and sets of the step."""
+        if self.x is not self.coulomb.x:
+            self.x, sets = self.coulomb.x, self.coulomb.kind
+            self.forces, self.sets = self.ffi.from_buffer("double[]", self.x), self.ffi.from_buffer("int[]", sets)
+        f.to, f.kind = self.forces, self.sets
 
 
 class FlatFriction(FlatContact):
@@ -265,13 +282,12 @@ class FlatFriction(FlatContact):
     def _fit(self, size: int) -> None:
         """See :meth:`FlatContact._fit`: without the problem of normal forces alone."""
 
-    def _balance(self, tol: float) -> Array:
+    def _balance(self, tol: float) -> None:
         """See :meth:`FlatContact._balance`."""
-        coulomb = self.side.coulomb
-        x = coulomb.solve(self.f.k // self.d, self.W, self.load, self.friction, tol, self.f.round == 0)
-        self.point(kind=coulomb.kind)
-        self.small.tally[0] = sum(side.coulomb.rounds for side in self.sides)
-        return x.ravel()
+        side, f = self.side, self.f
+        side.coulomb.solve(f.k // self.d, self.W, self.load, self.friction, tol, f.round == 0)
+        side.answer(f)
+        self.small.tally[0] = self.sides[0].coulomb.rounds + self.sides[1].coulomb.rounds
 
     def _pressed_rows(self) -> RubbingRows:
         s, k = self.d, len(self.row)
@@ -286,27 +302,30 @@ class FlatFriction(FlatContact):
 
     def _halt_flat(self, state: TissueState, v: Any) -> None:
         """See :meth:`FlatContact._halt_flat`. Collective."""
-        s, k, side = self.d, len(self.row), self.side
-        nodes = np.flatnonzero(self.x[:k:s] > 0)
-        on = (s * nodes[:, None] + np.arange(s)).ravel()
-        if on[-1] >= self.f.struck:
-            self.stops.enter()
-        if not np.array_equal(on, side.stopped):
-            side.stop(on, self.stops.A, self.sides[1 - self.n % 2])
-            side.jolt.kind[:], side.jolt.e[:] = side.coulomb.kind[nodes], side.coulomb.e[nodes]
-        x, before, rubbed = self.x[on].reshape(-1, s), -self.rates[on].reshape(-1, s), self.c.softgrasp_rubbed(self.f)
-        mean, slips = before.copy(), side.coulomb.kind[nodes] == SLIP
-        mean[slips, 1:] = 2 / self.dt * side.coulomb.y[nodes[slips], 1:]
-        y = rubbing_impulse(self, side.jolt, x, rubbed, self.friction[nodes], side.A, before, mean, self.f.still)
-        self.struck[:k] = 0.0
-        if y is None:
-            first = on[::s]
-            if np.abs(self.rates[first]).max() <= self.f.still:
+        f, side = self.f, self.side
+        step, jolt = side.coulomb.f, side.jolt
+        if not side.c.softgrasp_stays(f, side.rows, len(side.stopped)):
+            self._stop_others(side)
+        side.c.softgrasp_jolt(f, step, side.rows, side.block, jolt.f)
+        jolt.solve(len(side.mu), side.A, jolt.q, side.mu, f.still, known=True)
+        if not side.c.softgrasp_jolted(f, step, side.rows, jolt.f):
+            on = side.stopped[:: self.d]
+            b = self.rates[on]
+            if np.abs(b).max() <= f.still:
                 return
-            y, on = np.linalg.solve(self.stops.A[np.ix_(first, first)], self.rates[first]), first
-            self.table.energy[2] += y @ self.rates[first] / 2
-        self.struck[on] = y
+            self.struck[on] = np.linalg.solve(self.stops.A[np.ix_(on, on)], b)
+            self.table.energy[2] += self.struck[on] @ b / 2
         self._strike_flat(state, v)
+
+    def _stop_others(self, side: Side) -> None:
+        """Let impulses act on the rows that are pressed now. Collective."""
+        s, k = self.d, len(self.row)
+        nodes = np.flatnonzero(self.x[:k:s] > 0)
+        rows = (s * nodes[:, None] + np.arange(s)).ravel()
+        if rows[-1] >= self.f.struck:
+            self.stops.enter()
+        side.stop(rows, self.stops.A, self.friction[nodes], self.sides[1 - self.n % 2])
+        side.jolt.kind[:], side.jolt.e[:] = side.coulomb.kind[nodes], side.coulomb.e[nodes]
 
     def _sets(self) -> list[NDArray[Any]]:
         """See :meth:`Contact._sets`."""
@@ -322,5 +341,6 @@ class FlatFriction(FlatContact):
         for side, coulomb, stopped, jolt in zip(self.sides, sets[1::3], sets[2::3], sets[3::3], strict=True):
             side.coulomb.resume(coulomb, self.W, self.friction)
             if len(rows := stopped.astype(np.intp)):
-                side.stop(rows, self.stops.A, self.sides[1 - self.sides.index(side)])
-                side.jolt.resume(jolt, side.A, self.mu[self.row[rows[:: self.d], 0]])
+                other = self.sides[1 - self.sides.index(side)]
+                side.stop(rows, self.stops.A, self.friction[rows[:: self.d] // self.d], other)
+                side.jolt.resume(jolt, side.A, side.mu)

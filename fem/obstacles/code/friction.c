@@ -1,7 +1,7 @@
 /* Coulomb's law at k nodes with m tangents each, see coulomb.py: Newton's method on the sets open, stick and slip, whose
    equations are solved by conjugate residuals from the factor of some earlier round. Rows of a node: its normal, then
    its tangents. */
-#include "rub.h"
+#include "jolt.h"
 
 static const double NEAR = 0.2, EXACT = 1e-14; /* by how much a round reduces its residual, in 3D and in 2D */
 
@@ -36,7 +36,7 @@ static int classify(Rub *f) {
       for (int a = 0; a < f->m; a++) against += y[1 + a] * e[a];
       if (f->m > 1) {
         double z[2];
-        for (int a = 0; a < f->m; a++) size += (z[a] = x[1 + a] - y[1 + a] / w) * z[a];
+        for (int a = 0; a < f->m; a++) z[a] = x[1 + a] - y[1 + a] / w, size += z[a] * z[a];
         size = sqrt(size);
         if (size > 0)
           for (int a = 0; a < f->m; a++) e[a] = z[a] / size;
@@ -331,7 +331,7 @@ double softgrasp_wrong(Rub *f) {
     const double *x = f->x + i * s, *y = f->y + i * s, n = diagonal(f, i * s), w = diagonal(f, i * s + 1);
     double z[2], size = 0, bound = f->mu[i] * fmax(x[0], 0);
     most = fmax(most, fabs(x[0] - fmax(0, x[0] - y[0] / n)) * n);
-    for (int a = 0; a < f->m; a++) size += (z[a] = x[1 + a] - y[1 + a] / w) * z[a];
+    for (int a = 0; a < f->m; a++) z[a] = x[1 + a] - y[1 + a] / w, size += z[a] * z[a];
     size = sqrt(size);
     for (int a = 0; a < f->m; a++) most = fmax(most, fabs(x[1 + a] - (size > bound ? z[a] * bound / size : z[a])) * w);
   }

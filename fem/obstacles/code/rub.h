@@ -35,7 +35,8 @@ static const double READ = 2e10, FLOPS = 5e10, CALL = 3e-5; /* bytes and operati
 
 typedef struct {
   int k, m, ld;              /* nodes, tangents, columns of W */
-  const double *W, *q, *mu;
+  const double *W, *mu;
+  double *q;
   const double *inverse;     /* of W, (K, K) with K = k (1 + m), or NULL */
   const float *low, *inverse_low; /* both in single precision, where steps use it, or NULL */
   double tol;                /* of gaps and slips */

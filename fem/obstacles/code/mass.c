@@ -57,15 +57,15 @@ typedef struct {
   const int *rows;
   const long *at;       /* its values (count) */
   const double *values; /* a column after the other */
-  double *room;         /* of the longest column */
+  double *room;         /* of the longest column, for each of several x */
 } Lower;
 
-/* The rows of a block below it into the room, zeros after them; their number in whole groups. */
-static int fetch(const Lower *L, int s, const double *x) {
+/* The rows of a block below it into a room, zeros after them; their number in whole groups. */
+static int fetch(const Lower *L, int s, const double *x, double *room) {
   const int *rows = L->rows + L->first[s], r = L->first[s + 1] - L->first[s];
   int i = 0;
-  for (; i < r; i++) L->room[i] = x[rows[i]];
-  for (; i % 4; i++) L->room[i] = 0;
+  for (; i < r; i++) room[i] = x[rows[i]];
+  for (; i % 4; i++) room[i] = 0;
   return i;
 }
 
@@ -77,7 +77,7 @@ void softgrasp_ahead(const Lower *L, double *x) {
     int on = 0;
     for (int k = 0; k < m; k++) on |= y[k] != 0;
     if (!on) continue;
-    const int r = fetch(L, s, x);
+    const int r = fetch(L, s, x, L->room);
     const double *v = L->values + L->at[s];
     for (int k = 0; k < m; k++, v += width + r) {
       const double t = y[k];
@@ -89,13 +89,34 @@ void softgrasp_ahead(const Lower *L, double *x) {
   }
 }
 
-/* L^-T x in place. */
-void softgrasp_back(const Lower *L, double *x) {
+/* Products of v with a and b, of whole groups of four. */
+static void dots(int n, const double *v, const double *a, const double *b, double *of_a, double *of_b) {
+  double s[8] = {0}, t[8] = {0};
+  int i = 0;
+  for (; i + 8 <= n; i += 8)
+    for (int k = 0; k < 8; k++) s[k] += v[i + k] * a[i + k], t[k] += v[i + k] * b[i + k];
+  for (int k = 0; i < n && k < 4; k++) s[k] += v[i + k] * a[i + k], t[k] += v[i + k] * b[i + k];
+  *of_a = ((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7]));
+  *of_b = ((t[0] + t[4]) + (t[1] + t[5])) + ((t[2] + t[6]) + (t[3] + t[7]));
+}
+
+/* L^-T x in place, of `several` x of n numbers, two of them in one pass over L. */
+void softgrasp_back(const Lower *L, int several, int n, double *x) {
   for (int s = L->count - 1; s >= 0; s--) {
-    const int m = L->begin[s + 1] - L->begin[s], width = (m + 3) / 4 * 4, r = fetch(L, s, x);
+    const int m = L->begin[s + 1] - L->begin[s], width = (m + 3) / 4 * 4, r = (L->first[s + 1] - L->first[s] + 3) / 4 * 4;
     const double *v = L->values + L->at[s];
-    double *y = x + L->begin[s];
-    for (int k = 0; r && k < m; k++) y[k] -= dot(r, v + (size_t)k * (width + r) + width, L->room);
-    for (int k = m - 2; k >= 0; k--) y[k] -= dot(m - 1 - k, v + (size_t)k * (width + r) + k + 1, y + k + 1);
+    for (int j = 0; j < several; j++) fetch(L, s, x + (size_t)j * n, L->room + j * r);
+    for (int j = 0; j < several; j += 2) {
+      double *y = x + (size_t)j * n + L->begin[s], *z = y + n, *a = L->room + j * r, more, other;
+      for (int k = 0; j + 1 < several && r && k < m; k++) {
+        dots(r, v + (size_t)k * (width + r) + width, a, a + r, &more, &other);
+        y[k] -= more, z[k] -= other;
+      }
+      for (int k = 0; j + 1 == several && r && k < m; k++) y[k] -= dot(r, v + (size_t)k * (width + r) + width, a);
+    }
+    for (int j = 0; j < several; j++) {
+      double *y = x + (size_t)j * n + L->begin[s];
+      for (int k = m - 2; k >= 0; k--) y[k] -= dot(m - 1 - k, v + (size_t)k * (width + r) + k + 1, y + k + 1);
+    }
   }
 }

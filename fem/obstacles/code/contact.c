@@ -147,16 +147,8 @@ static void apply(const Flat *f) {
   }
 }
 
-/* Work of friction in the step. */
-double softgrasp_rubbed(const Flat *f) {
-  double work = 0;
-  for (int j = 0; j < f->k; j++)
-    if (f->row[4 * j + 3] != 0 && f->x[j] != 0) work += f->x[j] * 2 * value(f, j);
-  return work;
-}
-
 /* Tables of step n: force and number of pressed nodes of each half-space, T'N'x, and energies. */
-static void account(const Flat *f, int n) {
+static void account(Flat *f, int n) {
   double *force = f->force + (size_t)n * f->obstacles * f->d, *touching = f->touching + (size_t)n * f->obstacles;
   double *hand = f->hand + (size_t)n * f->n_s, energy[4] = {0}; /* of the step, or rounding of the sums would add up */
   for (int j = 0; j < f->k; j++) {
@@ -173,6 +165,7 @@ static void account(const Flat *f, int n) {
     if (row[3] == 0) energy[1] += f->x[j] * f->gap[(size_t)o * f->p + i];
     else energy[3] -= f->x[j] * 2 * value(f, j);
   }
+  f->rubbed = -energy[3];
   for (int k = 0; k < 4; k++) f->energy[k] += energy[k];
 }
 
@@ -326,7 +319,7 @@ int softgrasp_strike(Flat *f, int n, double *v) {
         kick[i] += S[c * m + i] * y;
       }
     }
-    work += f->y[j] * (f->m ? dot(f->k, f->A + (size_t)j * f->ld, f->y) : f->b[j]) / 2; /* without friction A y = b */
+    work += f->y[j] * f->b[j] / 2; /* A y = b */
     add_to_r(f, j, f->s * f->y[j]);
   }
   for (int i = 0; own && i < m; i++) {
