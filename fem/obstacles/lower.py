@@ -14,17 +14,16 @@ typedef struct {
   int count;
   const int *begin, *first, *rows;
   const long *at;
-  const double *values;
-  double *room;
+  double *values, *room;
 } Lower;
 int softgrasp_mass(int n, const int *ptr, const int *col, const double *M, const double *inverse, int most, double rtol,
   int *order, int count, double *x, double *room, char *in);
+void softgrasp_invert(const Lower *L);
 void softgrasp_ahead(const Lower *L, double *x);
 void softgrasp_back(const Lower *L, int several, int n, double *x);
 """
 GROUP = 4
 WASTE = 16
-MOST = 3  # vectors that a sweep takes at once
 
 
 class LowerFactor:
@@ -48,29 +47,30 @@ class LowerFactor:
         block, beneath = np.divmod(keys, n)
         count = np.bincount(block, minlength=len(sizes))
         first = np.concatenate([[0], np.cumsum(count)])
-        width, height = -(-sizes // GROUP) * GROUP, -(-count // GROUP) * GROUP
-        ends = np.cumsum(sizes * (width + height))
-        at = ends - sizes * (width + height)
+        width = -(-sizes // GROUP) * GROUP
+        ends = np.cumsum(width * (sizes + count))
+        at = ends - width * (sizes + count)
         column = np.repeat(np.arange(n), np.diff(ptr))
         place = rows - begin[of]
-        place[~inside] = of_key - first[of[~inside]] + width[of[~inside]]
+        place[~inside] = of_key - first[of[~inside]] + sizes[of[~inside]]
         values = np.zeros(int(ends[-1]))
-        values[at[of] + (column - begin[of]) * (width + height)[of] + place] = below.data
+        values[at[of] + place * width[of] + column - begin[of]] = below.data
         self.f, self.f.count = self.ffi.new("Lower *"), len(sizes)
         self.arrays: dict[str, Array] = {
             "begin": begin.astype(np.intc), "first": first.astype(np.intc), "rows": beneath.astype(np.intc),
-            "at": at.astype(np.int64), "values": values, "room": np.zeros(int(MOST * height.max())),
+            "at": at.astype(np.int64), "values": values, "room": np.zeros(2 * int((sizes + count).max()) + GROUP),
         }  # fmt: skip
         for name, array in self.arrays.items():
             kind = {"i": "int[]", "l": "long[]", "d": "double[]"}[array.dtype.char]
             setattr(self.f, name, self.ffi.from_buffer(kind, array))
+        self.c.softgrasp_invert(self.f)
 
     def ahead(self, x: Array) -> None:
         """L^-1 x in place, (n,)."""
         self.c.softgrasp_ahead(self.f, self.ffi.from_buffer("double[]", x))
 
     def back(self, x: Array) -> None:
-        """L^-T x in place, (n,), or of the rows of x (k, n), k up to 3."""
+        """L^-T x in place, (n,), or of every row of x (k, n)."""
         self.c.softgrasp_back(self.f, x.size // x.shape[-1], x.shape[-1], self.ffi.from_buffer("double[]", x))
 
 

@@ -178,6 +178,7 @@ static void begin_round(Rub *f) {
   residual(f, b);
   if (some) times(f, 0, u, v, (float *)(v + K));
   else memset(v, 0, K * sizeof(double));
+  memcpy(f->follows, v, K * sizeof(double));
   rows_times(f, u, v, f->solved);
   f->n = 0;
   for (int i = 0; i < f->k; i++) {
@@ -200,21 +201,22 @@ static void begin_round(Rub *f) {
    steps from this one. */
 static int descend(Rub *f) {
   const int K = f->k * (1 + f->m), n = f->n, wide = f->single ? 4 : 8;
-  double *u = f->room, *v = u + K;
+  double *u = f->room;
   const double step = wide * (0.5 * n * K + (double)n * n) / READ, factor = CALL + 2.0 / 3 * n * n * n / FLOPS * wide / 4;
   while (f->left > f->target && f->taken < KEPT) {
     if (!f->rows || f->slips0 != f->slips || (f->age && f->work > factor)) return WANTED;
-    double *z = f->Z + (size_t)f->taken * K, *c = f->C + (size_t)f->taken * K;
+    double *z = f->Z + (size_t)f->taken * K, *c = f->C + (size_t)f->taken * K, *v = f->V + (size_t)f->taken * K;
     f->work += step;
     f->age++;
     precondition(f, f->lacks, z);
     spread(f, z, u);
-    times(f, 0, u, v, (float *)(v + K));
+    times(f, 0, u, v, (float *)(u + K));
     rows_times(f, u, v, c);
     const double whole = dot(n, c, c);
     for (int j = 0; j < f->taken; j++) {
-      const double *C = f->C + (size_t)j * K, *Z = f->Z + (size_t)j * K, t = dot(n, C, c);
+      const double *C = f->C + (size_t)j * K, *Z = f->Z + (size_t)j * K, *V = f->V + (size_t)j * K, t = dot(n, C, c);
       for (int r = 0; r < n; r++) c[r] -= t * C[r], z[r] -= t * Z[r];
+      for (int r = 0; r < K; r++) v[r] -= t * V[r];
     }
     const double own = dot(n, c, c), size = sqrt(own), share = dot(n, c, f->lacks) / size;
     if (!(own > 1e-28 * whole)) break; /* rounding */
@@ -223,6 +225,7 @@ static int descend(Rub *f) {
       f->lacks[r] -= share * c[r];
       f->solved[r] += share * z[r];
     }
+    for (int r = 0; r < K; r++) f->follows[r] += share * (v[r] /= size);
     f->left = sqrt(dot(n, f->lacks, f->lacks));
     f->taken++;
   }
@@ -237,7 +240,8 @@ static void end_round(Rub *f) {
   for (int r = 0; r < K; r++) u[r] += known[r];
   f->begun = 0;
   if (f->slips) {
-    times(f, 1, u, v, NULL);
+    if (f->inverse_low) times(f, 1, u, v, NULL);
+    else v = f->follows;
     for (int r = 0; r < K; r++) f->y[r] += u[r], f->x[r] += v[r];
     return;
   }

@@ -48,75 +48,87 @@ int softgrasp_mass(int n, const int *ptr, const int *col, const double *M, const
   return rho > least ? -1 : count;
 }
 
-/* The columns of a factor L below ones on its diagonal, in blocks of neighbouring columns with the same rows: those of the
-   block in `width` numbers, from the first, then the rows below, in whole groups of four. */
+/* A factor L with ones on its diagonal, in blocks of neighbouring columns with the same rows: (D; V), D on the diagonal and V
+   below, becomes (D^-1; -V D^-1), so that a block is one product in both sweeps. Values of a block by rows, each in `wide`
+   numbers, whole groups of four. */
 typedef struct {
-  int count;            /* blocks */
-  const int *begin;     /* column with which each begins (count + 1) */
-  const int *first;     /* its first row below, by its place in `rows` (count + 1) */
+  int count;        /* blocks */
+  const int *begin; /* column with which each begins (count + 1) */
+  const int *first; /* its first row below, by its place in `rows` (count + 1) */
   const int *rows;
-  const long *at;       /* its values (count) */
-  const double *values; /* a column after the other */
-  double *room;         /* of the longest column, for each of several x */
+  const long *at;   /* its values (count) */
+  double *values;
+  double *room;     /* two of the longest columns, and four numbers */
 } Lower;
 
-/* The rows of a block below it into a room, zeros after them; their number in whole groups. */
-static int fetch(const Lower *L, int s, const double *x, double *room) {
-  const int *rows = L->rows + L->first[s], r = L->first[s + 1] - L->first[s];
-  int i = 0;
-  for (; i < r; i++) room[i] = x[rows[i]];
-  for (; i % 4; i++) room[i] = 0;
-  return i;
+typedef double Four __attribute__((vector_size(32)));
+
+static Four load(const double *from) {
+  Four v;
+  memcpy(&v, from, sizeof v);
+  return v;
+}
+
+static int wide(const Lower *L, int s) { return (L->begin[s + 1] - L->begin[s] + 3) / 4 * 4; }
+
+/* Invert the blocks: a row t of the result has t D = -v without the one on the diagonal. */
+void softgrasp_invert(const Lower *L) {
+  for (int s = 0; s < L->count; s++) {
+    const int m = L->begin[s + 1] - L->begin[s], r = L->first[s + 1] - L->first[s], width = wide(L, s);
+    double *v = L->values + L->at[s];
+    for (int i = m + r - 1; i > 0; i--) { /* upwards, as it reads the rows above */
+      double *row = v + (size_t)i * width;
+      for (int j = (i < m ? i : m) - 1; j >= 0; j--) {
+        const double t = row[j] = -row[j], *above = v + (size_t)j * width;
+        for (int k = 0; k < j; k++) row[k] += t * above[k];
+      }
+    }
+  }
 }
 
 /* L^-1 x in place. */
 void softgrasp_ahead(const Lower *L, double *x) {
   for (int s = 0; s < L->count; s++) {
-    const int m = L->begin[s + 1] - L->begin[s], width = (m + 3) / 4 * 4, *rows = L->rows + L->first[s];
-    double *y = x + L->begin[s];
-    int on = 0;
-    for (int k = 0; k < m; k++) on |= y[k] != 0;
-    if (!on) continue;
-    const int r = fetch(L, s, x, L->room);
+    const int m = L->begin[s + 1] - L->begin[s], r = L->first[s + 1] - L->first[s], width = wide(L, s);
+    const int *rows = L->rows + L->first[s];
     const double *v = L->values + L->at[s];
-    for (int k = 0; k < m; k++, v += width + r) {
-      const double t = y[k];
-      if (t == 0) continue;
-      for (int i = k + 1; i < m; i++) y[i] -= v[i] * t;
-      for (int i = 0; i < r; i++) L->room[i] -= v[width + i] * t;
+    double *y = x + L->begin[s], *old = L->room;
+    int on = 0;
+    for (int k = 0; k < width; k++) on |= (old[k] = k < m ? y[k] : 0) != 0;
+    if (!on) continue;
+    for (int i = 0; i < m + r; i++, v += width) {
+      Four sum = {0};
+      for (int k = 0; k < width; k += 4) sum += load(v + k) * load(old + k);
+      *(i < m ? y + i : x + rows[i - m]) += (sum[0] + sum[1]) + (sum[2] + sum[3]);
     }
-    for (int i = 0; i < L->first[s + 1] - L->first[s]; i++) x[rows[i]] = L->room[i];
   }
 }
 
-/* Products of v with a and b, of whole groups of four. */
-static void dots(int n, const double *v, const double *a, const double *b, double *of_a, double *of_b) {
-  double s[8] = {0}, t[8] = {0};
-  int i = 0;
-  for (; i + 8 <= n; i += 8)
-    for (int k = 0; k < 8; k++) s[k] += v[i + k] * a[i + k], t[k] += v[i + k] * b[i + k];
-  for (int k = 0; i < n && k < 4; k++) s[k] += v[i + k] * a[i + k], t[k] += v[i + k] * b[i + k];
-  *of_a = ((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7]));
-  *of_b = ((t[0] + t[4]) + (t[1] + t[5])) + ((t[2] + t[6]) + (t[3] + t[7]));
-}
-
-/* L^-T x in place, of `several` x of n numbers, two of them in one pass over L. */
+/* L^-T x in place, of `several` x of n numbers, two of them in one pass. */
 void softgrasp_back(const Lower *L, int several, int n, double *x) {
   for (int s = L->count - 1; s >= 0; s--) {
-    const int m = L->begin[s + 1] - L->begin[s], width = (m + 3) / 4 * 4, r = (L->first[s + 1] - L->first[s] + 3) / 4 * 4;
-    const double *v = L->values + L->at[s];
-    for (int j = 0; j < several; j++) fetch(L, s, x + (size_t)j * n, L->room + j * r);
+    const int m = L->begin[s + 1] - L->begin[s], r = L->first[s + 1] - L->first[s], width = wide(L, s);
+    const int *rows = L->rows + L->first[s];
     for (int j = 0; j < several; j += 2) {
-      double *y = x + (size_t)j * n + L->begin[s], *z = y + n, *a = L->room + j * r, more, other;
-      for (int k = 0; j + 1 < several && r && k < m; k++) {
-        dots(r, v + (size_t)k * (width + r) + width, a, a + r, &more, &other);
-        y[k] -= more, z[k] -= other;
+      const int both = j + 1 < several;
+      double *y = x + (size_t)j * n + L->begin[s], *z = both ? y + n : y, *a = L->room, *b = a + m + r;
+      memcpy(a, y, m * sizeof(double));
+      memcpy(b, z, m * sizeof(double));
+      for (int i = 0; i < r; i++) a[m + i] = (y - L->begin[s])[rows[i]], b[m + i] = (z - L->begin[s])[rows[i]];
+      for (int g = 0; g < m; g += 4) {
+        const double *v = L->values + L->at[s] + g;
+        Four of_a = {0}, of_b = {0}, more = {0}, other = {0};
+        int i = g + 1; /* rows above have zeros there */
+        for (; i + 1 < m + r; i += 2) {
+          const Four one = load(v + (size_t)i * width), two = load(v + (size_t)(i + 1) * width);
+          of_a += one * a[i], of_b += one * b[i];
+          more += two * a[i + 1], other += two * b[i + 1];
+        }
+        for (; i < m + r; i++) of_a += load(v + (size_t)i * width) * a[i], of_b += load(v + (size_t)i * width) * b[i];
+        of_a += more, of_b += other;
+        for (int k = 0; k < 4 && g + k < m; k++) y[g + k] += of_a[k];
+        for (int k = 0; both && k < 4 && g + k < m; k++) z[g + k] += of_b[k];
       }
-      for (int k = 0; j + 1 == several && r && k < m; k++) y[k] -= dot(r, v + (size_t)k * (width + r) + width, a);
-    }
-    for (int j = 0; j < several; j++) {
-      double *y = x + (size_t)j * n + L->begin[s];
-      for (int k = m - 2; k >= 0; k--) y[k] -= dot(m - 1 - k, v + (size_t)k * (width + r) + k + 1, y + k + 1);
     }
   }
 }

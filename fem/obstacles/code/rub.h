@@ -58,7 +58,8 @@ typedef struct {
   int begun, taken, n;       /* whether a round is in work, its steps and unknowns */
   double left, target;       /* its residual, and where it ends */
   double *solved, *lacks;    /* unknowns of the round, and residual (K) */
-  double *Z, *C;             /* its steps, and the matrix times them (KEPT, K) */
+  double *Z, *C, *V;         /* its steps, the matrix times them, and what follows from them (KEPT, K) */
+  double *follows;           /* what follows from the unknowns, where products are in double precision (K) */
   double *room;              /* 8 K numbers */
   double best;               /* least residual of the rounds, but for a factor of 2, */
   int since;                 /* and its round */
