@@ -85,7 +85,8 @@ class Coulomb(Rounds):
         self._point(
             before=self.before, before_y=self.before_y, x=x, y=y, kind=kind, e=e, pivot=self.pivot, kind0=self.kind0,
             q=self.q, mu=self.mu, e0=self.e0, solved=np.zeros(K), lacks=np.zeros(K), Z=np.zeros((KEPT, K)),
-            C=np.zeros((KEPT, K)), V=np.zeros((KEPT, K)), follows=np.zeros(K), room=np.zeros(8 * K), seen=np.zeros((ROUNDS[self.m], k), np.int8), tally=self.tally,
+            C=np.zeros((KEPT, K)), V=np.zeros((KEPT, K)), follows=np.zeros(K), room=np.zeros(8 * K),
+            seen=np.zeros((ROUNDS[self.m], k), np.int8), tally=self.tally,
         )  # fmt: skip
         self.f.k, self.f.m, self.f.rows, self.f.slips, self.f.had = k, self.m, 0, 0, 0
 

@@ -34,8 +34,8 @@ void softgrasp_jolt(const void *flat, const Rub *step, const int *rows, const do
   for (int r = 0; r < K; r++) jolt->q[r] = jolt->y[r] - jolt->q[r];
 }
 
-/* The impulses y that were found, the velocities A y that they stop, into b, and the energy that they take; nothing where
-   friction would not dissipate energy in the step, and false. */
+/* The impulses y that were found, the velocities A y that they stop, into b, and the energy that they take; where friction
+   would not dissipate energy in the step, y = 0 and false. */
 int softgrasp_jolted(const void *flat, const Rub *step, const int *rows, const Rub *jolt) {
   const Flat *f = flat;
   const int s = 1 + jolt->m, K = jolt->k * s;
@@ -46,7 +46,10 @@ int softgrasp_jolted(const void *flat, const Rub *step, const int *rows, const R
     f->y[j] = jolt->x[r] - f->dt * f->x[j];
     taken[r % s > 0] += f->y[j] * (f->b[j] - (jolt->y[r] - before(f, step, j)) / 2);
   }
-  if (taken[1] - f->rubbed < 0) return 0;
+  if (taken[1] - f->rubbed < 0) {
+    memset(f->y, 0, f->k * sizeof(double));
+    return 0;
+  }
   for (int r = 0; r < K; r++) f->b[rows[r]] = jolt->y[r] - before(f, step, rows[r]);
   f->energy[2] += taken[0];
   f->energy[3] += taken[1];
