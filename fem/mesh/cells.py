@@ -228,6 +228,8 @@ def check_interfaces(points: Floats, blocks: list[tuple[Integers, str]], name: s
     ``blocks``: corner nodes and shape of the cells of each type. Raises MeshError: there are such faces; the body would
     be open there.
     """
+    if all(shape == "tetra" for _, shape in blocks):
+        return
     faces = [cells[:, face] for cells, shape in blocks if DIMENSIONS[shape] == 3 for face in _FACES[shape]]
     quads = [face for face in faces if face.shape[1] == 4]
     triangles = [face for face in faces if face.shape[1] == 3]

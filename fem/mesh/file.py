@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -79,8 +80,34 @@ def read_mesh(
     return spread(comm, arrays)
 
 
+@dataclass(frozen=True)
+class Body:
+    """What a mesh file says of the body, in linear simplices that are not checked."""
+
+    path: Path  # of the file
+    points: Floats  # coordinates of the nodes that cells use, (n_points, d) [m]
+    cells: Integers  # nodes of the cells, (n_cells, d + 1)
+    cell_tags: Ints | None  # their marks
+    facets: Integers  # nodes of the marked facets, (n, d)
+    facet_tags: Ints | None  # their marks
+    cell_sets: Sets  # marks in cell_tags of each tag number and named set
+    facet_sets: Sets  # marks in facet_tags, likewise
+    notes: tuple[str, ...]  # on curved cells, one sentence each
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all that but the notes; some formats spread it over several files."""
+        sets = [np.frombuffer(_text(each).encode(), dtype=np.uint8) for each in (self.cell_sets, self.facet_sets)]
+        return digest(self.points, self.cells, self.cell_tags, self.facets, self.facet_tags, *sets)
+
+
 def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limit: float | None = None) -> MeshArrays:
     """Read and check a mesh file. Raises MeshError: see `read_mesh`."""
+    return checked(load_body(path, scale, limit), repair, seam)
+
+
+def load_body(path: Path, scale: float, limit: float | None = None) -> Body:
+    """Read a mesh file and cut its cells into simplices. Raises MeshError: see `read_mesh`."""
     raw = _read(path, limit)
     kinds = sorted({block.type for block in raw.cells})
     shapes = [shape_of(block.type) for block in raw.cells]
@@ -97,7 +124,10 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limi
     points = np.asarray(raw.points, dtype=np.float64) * scale
     tag_name = _tag_name(raw)
     bodies = _blocks(raw, dimension)
-    used = np.unique(np.concatenate([corners(nodes, shape).ravel() for _, shape, nodes in bodies]))
+    flags = np.zeros(len(points), dtype=np.bool_)
+    for _, shape, nodes in bodies:
+        flags[corners(nodes, shape)] = True
+    used, number = np.flatnonzero(flags), np.cumsum(flags) - 1
     if dimension == 2:
         points = _in_plane(points, used, path)
     curved = [check_straight(points, nodes, shape, raw.cells[i].type, str(path)) for i, shape, nodes in bodies]
@@ -107,27 +137,30 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limi
     shells = _blocks(raw, dimension - 1)
     cut = [simplices(corners(nodes, shape), shape) for _, shape, nodes in shells]
     facets, facet_tags, facet_sets = _marked(raw, shells, cut, tag_name, dimension - 1)
-    points, cells = points[used], np.searchsorted(used, cells)
-    cells = check_cells(points, cells, repair, str(path))
-    # Facets with a node that no cell uses belong to leftover geometry.
-    kept = np.isin(facets, used).all(axis=1)
-    facets = np.searchsorted(used, facets[kept])
-    facet_tags = None if facet_tags is None else facet_tags[kept]
+    kept = flags[facets].all(axis=1)  # facets with a node that no cell uses belong to leftover geometry
+    return Body(
+        path, points[used], number[cells], cell_tags, number[facets[kept]],
+        None if facet_tags is None else facet_tags[kept], cell_sets, facet_sets, tuple(itertools.chain(*curved)),
+    )  # fmt: skip
+
+
+def checked(body: Body, repair: bool, seam: float = SEAM) -> MeshArrays:
+    """The arrays of a body that is one. Raises MeshError: see `read_mesh`."""
+    points, facets, facet_tags, name = body.points, body.facets, body.facet_tags, str(body.path)
+    cells = check_cells(points, body.cells, repair, name)
     sides = sort_facets(cells)
     first = doubled_nodes(points, cells, sides, seam)
-    notes = [*itertools.chain(*curved), *doubled_text(points, first, seam, repair, str(path))]
+    notes = [*body.notes, *doubled_text(points, first, seam, repair, name)]
     if repair and notes:
         used, number = np.unique(first, return_inverse=True)
-        points, cells = points[used], check_cells(points[used], number[cells], False, str(path))
+        points, cells = points[used], check_cells(points[used], number[cells], False, name)
         _, sole = np.unique(np.sort(number[facets], axis=1), axis=0, return_index=True)  # one of both sides of a seam
         facets, facet_tags = number[facets][sole], None if facet_tags is None else facet_tags[sole]
         sides = sort_facets(cells)
-    # some formats spread coordinates, cells, tags and sets over several files
-    sets = [np.frombuffer(_text(each).encode(), dtype=np.uint8) for each in (cell_sets, facet_sets)]
-    text = digest(points, cells, cell_tags, facets, facet_tags, *sets)
-    known: dict[str, Any] = {"source": path.name, "notes": tuple(notes), "digest": text}
-    known |= {"facet_sets": facet_sets, "cell_sets": cell_sets}
-    return inspected((points, cells, cell_tags), (facets, facet_tags), sides, known, seam, str(path))
+    text = replace(body, points=points, cells=cells, facets=facets, facet_tags=facet_tags).digest
+    known: dict[str, Any] = {"source": body.path.name, "notes": tuple(notes), "digest": text}
+    known |= {"facet_sets": body.facet_sets, "cell_sets": body.cell_sets}
+    return inspected((points, cells, body.cell_tags), (facets, facet_tags), sides, known, seam, name)
 
 
 def _read(path: Path, limit: float | None) -> meshio.Mesh:

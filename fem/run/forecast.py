@@ -97,13 +97,15 @@ def forecast(
     )
 
 
-def forecasts(model: Model, n_e: int | None = None, cells: int | None = None) -> tuple[Forecast, ...]:
+def forecasts(
+    model: Model, scene: Scene | None = None, n_e: int | None = None, cells: int | None = None
+) -> tuple[Forecast, ...]:
     """Modelled time and memory of a run on its own number of ranks and on :data:`RANKS`, linear only.
 
     Args:
-        n_e, cells: unknowns and cells of the run; None: those of the model.
+        scene, n_e, cells: scene, unknowns and cells of the run; None: those of the model.
     """
-    scene, layout = model.scene, model.system.layout
+    scene, layout = scene or model.scene, model.system.layout
     if model.system.points is not None or model.system.frame is not None:
         return ()
     n, simplices = n_e or layout.n_e, cells or model.cells

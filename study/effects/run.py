@@ -32,7 +32,8 @@ from softgrasp.study.effects.result import EffectsStudy
 from softgrasp.study.effects.switch import Scales, switches
 from softgrasp.study.effects.together import Changes, advised
 from softgrasp.study.effects.verdict import assess, shows
-from softgrasp.study.forward.explain import Explanation, explain_model, fewer_cells
+from softgrasp.study.forward.copies import fewer_cells
+from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report import percent
 from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.shell import Session, folder_lock

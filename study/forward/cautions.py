@@ -67,10 +67,11 @@ def turned(angle: float) -> list[str]:
     ]
 
 
-def small_obstacles(model: Model, finer: float = 1.0) -> list[str]:
+def small_obstacles(model: Model, finer: float = 1.0, order: int | None = None) -> list[str]:
     """Obstacles that contact can miss between two boundary nodes. Collective.
 
-    ``finer``: edges of the cells over those of the model.
+    ``finer``: edges of the cells over those of the model;
+    ``order``: of the elements on these cells; None: that of the model.
     """
     if not model.scene.effects.obstacles:
         return []
@@ -79,12 +80,13 @@ def small_obstacles(model: Model, finer: float = 1.0) -> list[str]:
     from softgrasp.fem.obstacles.spacing import edge_parts
 
     layout, entries = model.system.layout, model.scene.obstacle or []
+    order = order or layout.order
     longest = finer * node_distance(model.space) * layout.order
-    parts = edge_parts(entries, layout.order, layout.dimension)
+    parts = edge_parts(entries, order, layout.dimension)
     divided = 1 if parts is None else int(parts(np.array([longest]))[0])
-    between, what = longest / max(divided, layout.order), "nodes" if divided == 1 else "points"
+    between, what = longest / max(divided, order), "nodes" if divided == 1 else "points"
     more = "" if any(entry.friction for entry in entries) else ", or more obstacle.parts"
-    return _nodes_alone(entries, layout.order, layout.dimension, longest) + [
+    return _nodes_alone(entries, order, layout.dimension, longest) + [
         f"Obstacle '{o.name}' is {size:.2g} m {'in radius' if o.kind in ('disc', 'ball') else 'thick'}, less than the "
         f"{between:.2g} m between boundary {what}: only {what} touch, so it can sink in between two; use "
         f"smaller cells{more}."

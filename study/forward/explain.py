@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
-from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,15 +19,11 @@ from softgrasp.fem import (
     percent,
     spread,
 )
-from softgrasp.fem.accuracy.price import fewer_lines
 from softgrasp.fem.effects import EFFECTS, Gate
 from softgrasp.fem.effects.gate import SMALL_SHARE, Sag
-from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.memory import (
     Need,
-    box_simplices,
-    check_memory,
     chosen,
     factor_bytes,
     need,
@@ -38,7 +32,6 @@ from softgrasp.fem.model.memory import (
 from softgrasp.fem.model.refined import by_lines, scene_ends
 from softgrasp.fem.model.scales import measure
 from softgrasp.fem.run.forecast import Forecast, forecasts
-from softgrasp.fem.solve.costs import BUILD
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT
 from softgrasp.study.forward.accuracy import estimate_error
 from softgrasp.study.forward.cautions import (
@@ -50,6 +43,7 @@ from softgrasp.study.forward.cautions import (
     small_obstacles,
     turned,
 )
+from softgrasp.study.forward.copies import LOOKED_AT, Copy, box_copy, build_seconds, coarser_copy, cubic_copy
 from softgrasp.study.forward.result import ModelSizes, model_sizes, output_places
 from softgrasp.study.report import to_json
 from softgrasp.study.report.equation import Equation, equation
@@ -58,8 +52,8 @@ if TYPE_CHECKING:  # plans are not imported where a scene asks for none
     from softgrasp.lqr.design.constrained import PlanSizes
 
 MODES = 6
-MOST_LOOKED_AT = {2: 8_000, 3: 6_000}  # unknowns that modes, sag and estimate are computed on
-ESTIMATE_SECONDS = 0.5  # a dearer estimate of the mesh is left to simulate
+ESTIMATE_SECONDS = 0.5  # a dearer estimate of the mesh is left to simulate,
+COPY_SECONDS = 0.3  # of a copy, whose estimate is extrapolated anyway, it is made on even fewer cells
 LARGE = 200_000  # cells beyond which rank 0 does not look for the ends
 BUILT_SECONDS = 0.1  # modelled time beyond which the sizes of a box are computed and nothing of it is assembled
 
@@ -141,8 +135,10 @@ class Explanation:
     snapshot_columns: int  # number of states that the run stores in memory
     snapshot_bytes: int  # memory of these states over all ranks [byte]
     mesh: MeshSummary  # singular ends, and the error they leave
-    coarser: int  # unknowns of the coarser copy of a large mesh that gives modes, sag and estimate [1]; 0: none
-    built: bool  # whether the mesh itself was; else its sizes are computed: unknowns to 1 %, entries to 10 %
+    coarser: int  # unknowns of the smaller copy of a large mesh that gives modes, sag and estimate [1]; 0: none
+    built: bool  # whether the mesh itself was assembled; else the entries are computed from the copy
+    counted: bool  # whether the unknowns are counted; else computed from the copy
+    copied: str  # whose modes and sag these are, where they are a copy's, in sentences
     dimension: int  # 2 or 3
     plan: PlanSizes | None = None  # of the plan past obstacles that `control` makes; None where it makes none
 
@@ -153,13 +149,14 @@ class Explanation:
 
 
 def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
-    """Assemble a scene, of a large box a copy on fewer cells, and say what it is. Collective."""
+    """Assemble a scene, of a large mesh a smaller copy, and say what it is. Collective."""
     if build_seconds(scene) > BUILT_SECONDS:
-        check_memory(scene, comm, False, len(scene.tissue.cells or []), box_simplices(scene.tissue.cells or []))
-        copy = on_fewer_cells(scene, comm)
-        if copy is not None:
-            return _explained(scene, copy, sizes_from(copy, scene))
-    return explain_model(build(scene, comm=comm, run=False))
+        copy, mesh = box_copy(scene, comm), None
+    else:
+        copy, mesh = cubic_copy(scene, comm)
+    if copy is not None:
+        return _explained(scene, copy.model, copy.sizes, copy=copy)
+    return explain_model(build(scene, comm=comm, mesh=mesh, run=False))
 
 
 def explain_model(model: Model) -> Explanation:
@@ -167,55 +164,14 @@ def explain_model(model: Model) -> Explanation:
     return _explained(model.scene, coarser_copy(model), model_sizes(model), model)
 
 
-def build_seconds(scene: Scene) -> float:
-    """Modelled time to build a box [s]; 0 for other scenes.
-
-    Scenes are others too where a tolerance chooses the cells, and where a plan asks for the nodes of the mesh itself.
-    """
-    tissue, control, refine = scene.tissue, scene.control, scene.tissue.refine
-    planned = control is not None and control.constraints is not None
-    if not tissue.cells or scene._given is not None or planned:
-        return 0.0
-    d = len(tissue.cells)
-    if refine is not None and not (by_lines(scene) and refine.tolerance is None and d * _lattice(scene) <= refine.most):
-        return 0.0
-    return BUILD[d, tissue.order] * box_simplices(tissue.cells)
-
-
-def _lattice(scene: Scene) -> int:
-    """Nodes of a box, whose lines may crowd."""
-    return math.prod(scene.tissue.order * n + 1 for n in scene.tissue.cells or [])
-
-
-def _pairs(scene: Scene) -> int:
-    """Pairs of nodes of a box of simplices that share one, (i, j) and (j, i), those of a node with itself too."""
-    sides = [scene.tissue.order * n + 1 for n in scene.tissue.cells or []]
-    steps = product((0, 1), repeat=len(sides))
-    return 2 * sum(math.prod(n - o for n, o in zip(sides, step, strict=True)) for step in steps) - math.prod(sides)
-
-
-def sizes_from(copy: Model, scene: Scene) -> ModelSizes:
-    """Sizes of a box from those of its copy on fewer cells. Collective.
-
-    Measured: unknowns to 0.1 % in 2D and 1 % in 3D; entries to 0.5 % in 2D and, of quadratic cells in 3D, 10 %.
-    """
-    sizes, d = model_sizes(copy), copy.system.layout.dimension
-    nodes, linked = _lattice(scene), _pairs(scene) / _pairs(copy.scene)  # nodes of the boundary have fewer neighbours
-    held = (d * sizes.nodes - sizes.n_e) * (nodes / sizes.nodes) ** ((d - 1) / d)  # the zone is a surface
-    n_e = float(f"{d * nodes - held:.2e}")
-    free = (n_e / nodes) / (sizes.n_e / sizes.nodes)
-    nonzeros = float(f"{sizes.nonzeros * linked * free:.1e}")
-    return replace(
-        sizes, n_e=int(n_e), states=2 * (sizes.n_s + int(n_e)), cells=box_simplices(scene.tissue.cells or []),
-        nodes=nodes, nonzeros=int(nonzeros),
-    )  # fmt: skip
-
-
-def _explained(scene: Scene, looked: Model, sizes: ModelSizes, model: Model | None = None) -> Explanation:
+def _explained(
+    scene: Scene, looked: Model, sizes: ModelSizes, model: Model | None = None, copy: Copy | None = None
+) -> Explanation:
     """The explanation of a scene of these sizes; modes and sag are those of ``looked``.
 
-    Collective. ``model``: that of the scene, None where it was not built.
+    Collective. ``model``: that of the scene, None where there is a ``copy`` instead.
     """
+    known = model or looked
     d, ranks = looked.system.layout.dimension, sizes.ranks
     work = steps_of(scene, sizes.n_e, d, ranks)
     name, reason = chosen(scene, work)
@@ -238,6 +194,9 @@ def _explained(scene: Scene, looked: Model, sizes: ModelSizes, model: Model | No
         columns = len(spread(columns, looked_at(sizes.n_e)))
     dt = scene.time_end / scene.time.steps
     poisson = poisson_ratios(small)
+    copied = "" if copy is None else copy.text
+    if model is not None and looked is not model:
+        copied = f"{LOOKED_AT}the same scene on coarser cells, n_e = {small.layout.n_e}."
     return Explanation(
         name=scene.name,
         equation=equation(scene),
@@ -257,28 +216,25 @@ def _explained(scene: Scene, looked: Model, sizes: ModelSizes, model: Model | No
         idle=tuple(key for key, r in reports.items() if r.on and not r.gate.matters),
         sag=problem.sag,
         warnings=(
-            *(looked if model is None else model).space.mesh.notes,
+            *known.space.mesh.notes,
             *_warnings(scene, poisson, omega, dt, d, reports, problem.sag),
-            *small_obstacles(looked if model is None else model, _shrunk(scene, looked) if model is None else 1.0),
+            *small_obstacles(known, 1.0 if copy is None else copy.finer, scene.tissue.order),
             *away,
         ),
+    known = model or looked
         outputs=output_places(looked if model is None else model),
         memory=need(scene, d, sizes.cells, ranks, run=True),
         forecasts=forecasts(looked, sizes.n_e, sizes.cells),
         snapshot_columns=columns,
         snapshot_bytes=16 * sizes.n_e * columns,
-        mesh=mesh_report(looked, sizes.n_e, model),
+        mesh=mesh_report(scene, looked, sizes.n_e, model, copy),
         coarser=0 if looked is model else small.layout.n_e,
         built=model is not None,
+        counted=copy is None or copy.counted,
+        copied=copied,
         dimension=d,
         plan=None if model is None else _plan(model),
     )
-
-
-def _shrunk(scene: Scene, copy: Model) -> float:
-    """Edges of the cells of a box over those of its copy, the largest ratio of all directions [1]."""
-    pairs = zip(copy.scene.tissue.cells or [], scene.tissue.cells or [], strict=True)
-    return max(few / many for few, many in pairs)
 
 
 def _plan(model: Model) -> PlanSizes | None:
@@ -290,54 +246,23 @@ def _plan(model: Model) -> PlanSizes | None:
     return plan_sizes(model)
 
 
-def coarser_copy(model: Model) -> Model:
-    """The scene of a large box on fewer cells, for numbers of two digits; else the model itself. Collective."""
-    if fewer_cells(model, MOST_LOOKED_AT) is None:
-        return model
-    return on_fewer_cells(model.scene, model.system.layout.comm) or model
-
-
-def fewer_cells(model: Model, most: dict[int, int]) -> Scene | None:
-    """The scene of a box that has more unknowns than ``most`` by dimension, on that many; None of any other scene."""
-    tissue, layout = model.scene.tissue, model.system.layout
-    adaptive = tissue.refine is not None and tissue.refine.tolerance is not None
-    if tissue.cells is None or adaptive or layout.n_e <= most[layout.dimension]:
-        return None
-    return _coarsened(model.scene, most)
-
-
-def _coarsened(scene: Scene, most: dict[int, int]) -> Scene:
-    """The scene of a box on the cells of about so many unknowns, by dimension."""
-    cells = scene.tissue.cells or []
-    ratio = (most[len(cells)] / (len(cells) * _lattice(scene))) ** (1 / len(cells))
-    fewer = fewer_lines(scene, [max(int(ratio * n), 1) for n in cells])
-    return scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"cells": fewer})})
-
-
-def on_fewer_cells(scene: Scene, comm: MPI.Intracomm) -> Model | None:
-    """The scene of a box on fewer cells; None where these miss the zone or a layer. Collective."""
-    try:
-        return build(_coarsened(scene, MOST_LOOKED_AT), comm=comm, run=False)
-    except (MeshError, SceneError):
-        return None
-
-
-def mesh_report(looked: Model, n_e: int, model: Model | None) -> MeshSummary:
+def mesh_report(
+    scene: Scene, looked: Model, n_e: int, model: Model | None = None, copy: Copy | None = None
+) -> MeshSummary:
     """Look for singular ends and estimate the error, that of a coarser copy where the mesh is large. Collective."""
-    known = looked if model is None else model
-    scene, tissue = known.scene, known.space.mesh
-    refine = scene.tissue.refine
+    known = model or looked
+    tissue, order, refine = known.space.mesh, scene.tissue.order, scene.tissue.refine
     small = tissue.mesh.topology.index_map(tissue.dimension).size_global <= LARGE
-    ends = scene_ends(known.system.layout.comm, tissue, scene) if small else None
+    ends = scene_ends(known.system.layout.comm, tissue, known.scene) if small else None
     pairs = () if ends is None else zip(ends.kind, ends.alpha, strict=True)
     counts = Counter((kind, round(float(alpha), 3)) for kind, alpha in pairs)
     kinds = tuple(EndReport(k, n, a) for (k, a), n in sorted(counts.items(), key=lambda item: item[0][1]))
     graded = refine is not None and refine.grading != "off"
     edges = graded and tissue.dimension == 3 and not by_lines(scene)
-    order = 2.0 * scene.tissue.order if ends is None else expected_order(ends, scene.tissue.order, graded, edges)
+    converges = 2.0 * order if ends is None else expected_order(ends, order, graded, edges)
     error = None if model is None else estimate_error(model, ESTIMATE_SECONDS)[0]
-    if error is None and looked is not model:
-        found = estimate_error(looked, ESTIMATE_SECONDS)[0]
+    if error is None and looked is not model and looked.scene.tissue.order == order:
+        found = estimate_error(looked, ESTIMATE_SECONDS if copy is None else COPY_SECONDS)[0]
         error = None if found is None else extrapolated(found, known, n_e)
     coarse = error is not None and error.by == "coarser"
     values = (
@@ -351,7 +276,7 @@ def mesh_report(looked: Model, n_e: int, model: Model | None) -> MeshSummary:
         )
     )
     first = refine is not None and refine.tolerance is not None and refine.passes > 0
-    return MeshSummary(kinds, order, graded, first, coarse, *values)
+    return MeshSummary(kinds, converges, graded, first, coarse, *values)
 
 
 def _warnings(

@@ -42,10 +42,10 @@ def run_explain(
 def sections(result: Explanation) -> list[Section]:
     """The parts of the page."""
     s, t, solver = result.sizes, result.time, result.solver
-    about = "" if result.built else "about "
+    about, near = "" if result.counted else "about ", "" if result.built else "about "
     sizes = [
         ("hand, tissue unknowns, states", f"n_s = {s.n_s}, n_e = {about}{s.n_e}, 2n = {about}{s.states}"),
-        ("cells, nodes, non-zeros of K_ee", f"{s.cells}, {s.nodes}, {about}{s.nonzeros}"),
+        ("cells, nodes, non-zeros of K_ee", f"{s.cells}, {s.nodes}, {near}{s.nonzeros}"),
         *((f"output {name}", place) for name, place in result.outputs.items()),
         ("Poisson's ratio", ", ".join(f"{nu:.4g} ({name})" for name, nu in result.poisson.items())),
         ("solver", f"{solver.name}: {solver.reason}"),
@@ -66,11 +66,7 @@ def sections(result: Explanation) -> list[Section]:
              for name, e in result.effects.items() if e.on]  # fmt: skip
     periods = [(k, w, T, t.dt / T) for k, (w, T) in enumerate(zip(t.omega, t.periods, strict=True), 1)]
     modes = ("mode", "omega [1/s]", "period [s]", "dt / period")
-    whose = "Modes, sag" if result.built else "So large a mesh is not assembled here: modes, sag, places of outputs"
-    text = f"{whose} and what follows from them are those of the same scene on coarser cells, n_e = {result.coarser}."
-    if not result.built:
-        text += " Sizes with about are computed from that copy, to 1 % of the unknowns and 10 % of the non-zeros."
-    copied = [text] if result.coarser else []
+    copied = [result.copied] if result.copied else []
     about_mesh = [*copied, *mesh_lines(result.mesh, result.dimension)]
     no_modes = "" if periods else "Not computed: the factor would not fit."
     parts = [
@@ -109,7 +105,7 @@ def forecast_section(forecasts: Sequence[Forecast]) -> list[Section]:
 def summary(result: Explanation) -> list[str]:
     """What it is, in three sentences."""
     on = [name for name, e in result.effects.items() if e.on]
-    sag, s, about = result.sag, result.sizes, "" if result.built else "about "
+    sag, s, about = result.sag, result.sizes, "" if result.counted else "about "
     return [
         f"The tissue has n_e = {about}{s.n_e} unknowns in {s.cells} cells; {result.solver.name} solves its "
         f"{result.time.steps} steps of {result.time.dt:.3g} s.",

@@ -25,7 +25,8 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from softgrasp.study.forward.cautions import inexact, run_warnings
-from softgrasp.study.forward.explain import Explanation, build_seconds, explain
+from softgrasp.study.forward.copies import build_seconds
+from softgrasp.study.forward.explain import Explanation, explain
 from softgrasp.study.forward.explain_page import run_explain, sections
 from softgrasp.study.report.document import show_sections
 from softgrasp.study.report.equation import equation
@@ -293,7 +294,7 @@ def test_a_large_scene_is_explained_by_coarser_cells(
     scene = load_scene(name, [*changes, cells])
     monkeypatch.setattr("softgrasp.study.forward.explain.BUILT_SECONDS", math.inf)
     copied = explain(scene, comm)
-    monkeypatch.setattr("softgrasp.study.forward.explain.MOST_LOOKED_AT", {2: 10**7, 3: 10**7})
+    monkeypatch.setattr("softgrasp.study.forward.copies.MOST_LOOKED_AT", {2: 10**7, 3: 10**7})
     own = explain(scene, comm)
     assert (own.coarser, copied.sizes.n_e) == (0, own.sizes.n_e)
     assert 0 < copied.coarser <= {2: 8_000, 3: 6_000}[own.dimension]
@@ -322,7 +323,7 @@ def test_a_box_too_large_to_build_is_explained_by_computed_sizes(
 ) -> None:
     """Sizes against those of the mesh itself, the rest against the copy that a smaller mesh is explained by."""
     scene = load_scene(name, [*changes, cells])
-    monkeypatch.setattr("softgrasp.study.forward.explain.MOST_LOOKED_AT", {2: 4_000, 3: 2_000})
+    monkeypatch.setattr("softgrasp.study.forward.copies.MOST_LOOKED_AT", {2: 4_000, 3: 2_000})
     monkeypatch.setattr("softgrasp.study.forward.explain.BUILT_SECONDS", math.inf)
     own = explain(scene, comm)
     monkeypatch.setattr("softgrasp.study.forward.explain.BUILT_SECONDS", 1e-3)

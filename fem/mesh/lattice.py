@@ -1,0 +1,164 @@
+"""A coarser copy of a large simplex mesh: the lattice cells that its body fills, their corners moved to its boundary.
+
+    n_v = sum over cells T of |T| grad phi_v = integral of phi_v n over the boundary
+
+vanishes at the nodes v inside, and the sizes of the others add up to the surface. Each lattice cell that the body fills
+by half is cut in 2 triangles or 6 tetrahedra; corners on the boundary of these move to the nearest node of that of the
+body, as far as no cell loses nine tenths of its volume. Lattice lines meet the ends of given boxes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise, permutations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from softgrasp.fem.compiled import functions
+from softgrasp.fem.mesh.check import SEAM, Facets, Flags, Floats, Integers, Ints, signed_volumes, sort_facets
+from softgrasp.fem.mesh.tissue_mesh import MeshArrays, inspected
+from softgrasp.fem.solve.differences import packed
+
+if TYPE_CHECKING:
+    from softgrasp.fem.mesh.file import Body
+
+INSIDE = 1e-6  # size of a nodal normal over that of its parts, below which the node is inside [1]: far above rounding
+NEAR_END = 0.3  # of a cell: an end of a box so near to another line needs none [1]
+LEAST = 0.1  # of its volume, which a cell keeps [1]
+SAMPLE = 2000  # cells whose volumes give the lattice its edges, about [1]
+MOVES = 16  # attempts to move the corners, each by half as far around cells that would lose more
+
+
+@dataclass(frozen=True)
+class LatticeCopy:
+    """A body on lattice cells, and what both have of it."""
+
+    arrays: MeshArrays  # the copy
+    ends: Flags  # nodes of the body that lie on its boundary, (n_points,)
+    area: Floats  # surface of the body that goes with each node [m^(d-1)], (n_points,)
+    volume: float  # of the copy over that of the body, less 1 [1]
+    surface: float  # likewise of the boundary [1]
+    finer: float  # edge of a cell of the body over that of a cell of the copy, both of mean volume [1]
+
+
+def lattice_copy(body: Body, most: int, boxes: Sequence[Any]) -> LatticeCopy | None:
+    """The body on at most about so many lattice cells; None without compiled code, or where a cell is inverted.
+
+    ``boxes``: [low, high] of zones and layers, whose ends lattice lines shall meet.
+    """
+    code = functions(Path(__file__).with_name("body.c"), "large mesh files are assembled to explain them")
+    if code is None:
+        return None
+    points, d = body.points, body.points.shape[1]
+    some = body.cells[:: max(len(body.cells) // SAMPLE, 1)]
+    mean = float(signed_volumes(points, some).mean())
+    h = (max(mean, 0.0) * len(body.cells) / most) ** (1 / d)
+    low, high = points.min(axis=0), points.max(axis=0)
+    if not h > 0:
+        return None
+    lines = [_lines(low[k], high[k], [x for box in boxes for x in (box[0][k], box[1][k])], h) for k in range(d)]
+    fill, normals, parts, least = _measured(code, body, lines)
+    area, volume = np.linalg.norm(normals, axis=1), float(fill.sum())
+    ends = area > INSIDE * parts
+    corners, cells, marks = _filled(lines, fill)
+    if not least > 0 or not len(cells):
+        return None
+    sides = sort_facets(cells)
+    tree = cKDTree(points[ends])
+    corners = _moved(corners, cells, np.unique(sides.nodes[sides.outer]), points[ends], tree, h)
+    facets, tags = _tagged(body, corners, sides, np.flatnonzero(ends), tree)
+    known: dict[str, Any] = {"source": body.path.name, "notes": (), "digest": body.digest}
+    known |= {"facet_sets": body.facet_sets, "cell_sets": body.cell_sets}
+    arrays = inspected(
+        (corners, cells, None if body.cell_tags is None else marks), (facets, tags), sides, known, SEAM, str(body.path)
+    )
+    outer = sizes_of(corners, sides.nodes[sides.outer])
+    copied = float(signed_volumes(corners, cells).sum())
+    finer = (volume / len(body.cells) / (copied / len(cells))) ** (1 / d)
+    return LatticeCopy(arrays, ends, area, copied / volume - 1, float(outer.sum() / area[ends].sum()) - 1, float(finer))
+
+
+def sizes_of(points: Floats, facets: Integers) -> Floats:
+    """Lengths or areas of facets (n, d), (n,) [m^(d-1)]."""
+    edges = points[facets[:, 1:]] - points[facets[:, :1]]
+    gram = np.linalg.det(edges @ edges.transpose(0, 2, 1))
+    return np.asarray(np.sqrt(gram) / math.factorial(edges.shape[1]))
+
+
+def _lines(low: float, high: float, ends: Sequence[float], h: float) -> Floats:
+    """Lattice lines about h apart that meet both sides and the ends between them."""
+    met = [low]
+    for x in sorted(ends):
+        if min(x - met[-1], high - x) > NEAR_END * h:
+            met.append(x)
+    gaps = [*pairwise(met), (met[-1], high)]
+    return np.concatenate([[low], *(np.linspace(a, b, max(round((b - a) / h), 1) + 1)[1:] for a, b in gaps)])
+
+
+def _measured(code: Any, body: Body, lines: list[Floats]) -> tuple[Floats, Floats, Floats, float]:
+    """Volume by lattice cell and mark, nodal normals, size of their parts, and the least volume of a cell."""
+    points, cells = np.ascontiguousarray(body.points), np.ascontiguousarray(body.cells)
+    marks = 1 if body.cell_tags is None else int(body.cell_tags.max()) + 1
+    count = np.array([len(each) - 1 for each in lines], dtype=np.int64)
+    fill, normals, parts = np.zeros((*count, marks)), np.zeros_like(points), np.zeros(len(points))
+    least, every = np.full(1, np.inf), np.concatenate(lines)
+    tags = None if body.cell_tags is None else np.ascontiguousarray(body.cell_tags)
+    arrays = (cells, points, tags, count, every, fill, normals, parts, least)
+    code.softgrasp_body(packed(len(cells), points.shape[1], marks, *arrays))
+    return fill, normals, parts, float(least[0])
+
+
+def _filled(lines: list[Floats], fill: Floats) -> tuple[Floats, Integers, Ints]:
+    """Corners, simplices of positive volume, and their marks, of the lattice cells that are filled by half."""
+    d = len(lines)
+    size = np.diff(lines[0])
+    for each in lines[1:]:
+        size = np.multiply.outer(size, np.diff(each))
+    full = fill.sum(axis=-1) >= size / 2
+    lowest, shape = np.argwhere(full), [len(each) for each in lines]
+    cells = []
+    for order in permutations(range(d)):
+        path = np.cumsum(np.vstack([np.zeros((1, d), dtype=int), np.eye(d, dtype=int)[list(order)]]), axis=0)
+        odd = np.linalg.det(np.diff(path, axis=0)) < 0
+        path[[-2, -1]] = path[[-1, -2]] if odd else path[[-2, -1]]
+        cells.append(np.stack([np.ravel_multi_index(tuple((lowest + step).T), shape) for step in path], axis=1))
+    marks = np.tile(fill[full].argmax(axis=1), math.factorial(d)).astype(np.int32)
+    used, numbers = np.unique(np.concatenate(cells), return_inverse=True)
+    places = np.unravel_index(used, shape)
+    corners = np.stack([each[place] for each, place in zip(lines, places, strict=True)], axis=1)
+    return corners, numbers.reshape(-1, d + 1).astype(np.int64), marks
+
+
+def _moved(corners: Floats, cells: Integers, outer: Integers, ends: Floats, tree: Any, h: float) -> Floats:
+    """The corners, those on the boundary of the copy moved to the nearest node of that of the body."""
+    before = signed_volumes(corners, cells)
+    distance, nearest = tree.query(corners[outer])
+    step = np.zeros_like(corners)
+    step[outer] = np.where((distance < h)[:, None], ends[nearest] - corners[outer], 0.0)
+    share = np.ones(len(corners))
+    for attempt in range(MOVES):
+        moved = corners + share[:, None] * step
+        bad = signed_volumes(moved, cells) < LEAST * before
+        if not bad.any():
+            return moved
+        share[np.unique(cells[bad])] *= 0.5 if attempt < MOVES // 2 else 0.0
+    return corners
+
+
+def _tagged(body: Body, corners: Floats, sides: Facets, ends: Integers, tree: Any) -> tuple[Integers, Ints | None]:
+    """Facets on the boundary of the copy, with the mark of the marked facets of the body nearest to each."""
+    nodes = sides.nodes[sides.outer]
+    if body.facet_tags is None:
+        return nodes[:0], None
+    on = np.zeros(len(body.points), dtype=np.bool_)
+    on[ends] = True
+    inner = on[body.facets].all(axis=1)
+    marks = np.full(len(body.points), -1, dtype=np.int32)
+    marks[body.facets[inner]] = body.facet_tags[inner, None]
+    found = marks[ends[tree.query(corners[nodes].mean(axis=1))[1]]]
+    return nodes[found >= 0], found[found >= 0]
