@@ -90,9 +90,10 @@ def fewer_lines(scene: Scene, most: list[int]) -> list[int]:
     return result
 
 
-def affordable(model: Model, budget: float) -> Plan | None:
-    """The best way to estimate within so many seconds, if there is one."""
-    return next((plan for plan in plans(model) if plan.seconds <= budget), None)
+def affordable(model: Model, budget: float, cheapest: bool = False) -> Plan | None:
+    """The best, or cheapest, way to estimate within so many seconds, if there is one."""
+    ways = [plan for plan in plans(model) if plan.seconds <= budget]
+    return min(ways, key=lambda plan: plan.seconds) if cheapest and ways else next(iter(ways), None)
 
 
 def _estimate_seconds(model: Model, share: float = 1.0) -> float:

@@ -2,12 +2,13 @@
 #include <stdint.h>
 
 typedef struct {
-  long long cells, d, marks;       /* number of simplices, 2 or 3, number of marks */
+  long long cells, d, marks, many; /* number of simplices, 2 or 3, number of marks, and of points in a simplex */
   const int64_t *nodes;            /* of the simplices, d + 1 each */
   const double *x;                 /* coordinates, d each [m] */
   const int32_t *mark;             /* of each simplex, or 0 */
   const int64_t *count;            /* lattice cells along each axis */
   const double *lines;             /* lattice lines, count + 1 of each axis [m] */
+  const double *share;             /* barycentric coordinates of the points but the first, d each */
   double *fill;                    /* volume by lattice cell and mark */
   double *normal;                  /* nodal normals, the integral of phi_v n over the boundary, d each */
   double *parts;                   /* sum of the sizes of what a nodal normal adds up */
@@ -51,15 +52,17 @@ void softgrasp_body(const Body *b) {
       for (long long i = 1; i <= d; i++) g[0][k] -= g[i][k];
     }
     if (!(volume >= *b->least)) *b->least = volume;
-    long long place = 0;
-    const double *lines = b->lines;
-    for (long long k = 0; k < d; k++) {
-      double middle = x0[k];
-      for (long long i = 0; i < d; i++) middle += e[i][k] / (d + 1);
-      place = place * b->count[k] + below(lines, b->count[k], middle);
-      lines += b->count[k] + 1;
+    for (long long m = 0; m < b->many; m++) { /* each point stands for as much of the simplex */
+      long long place = 0;
+      const double *lines = b->lines;
+      for (long long k = 0; k < d; k++) {
+        double at = x0[k];
+        for (long long i = 0; i < d; i++) at += b->share[m * d + i] * e[i][k];
+        place = place * b->count[k] + below(lines, b->count[k], at);
+        lines += b->count[k] + 1;
+      }
+      b->fill[place * b->marks + (b->mark ? b->mark[c] : 0)] += volume / b->many;
     }
-    b->fill[place * b->marks + (b->mark ? b->mark[c] : 0)] += volume;
     for (long long i = 0; i <= d; i++)
       for (long long k = 0; k < d; k++) {
         b->normal[node[i] * d + k] += g[i][k];

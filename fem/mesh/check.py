@@ -31,6 +31,13 @@ def signed_volumes(points: Floats, cells: Integers) -> Floats:
     return np.asarray(np.linalg.det(edges) / math.factorial(points.shape[1]), dtype=np.float64)
 
 
+def sizes_of(points: Floats, facets: Integers) -> Floats:
+    """Lengths or areas of facets (n, d), (n,) [m^(d-1)]."""
+    edges = points[facets[:, 1:]] - points[facets[:, :1]]
+    gram = np.linalg.det(edges @ edges.transpose(0, 2, 1))
+    return np.asarray(np.sqrt(gram) / math.factorial(edges.shape[1]))
+
+
 def longest_edges(points: Floats, cells: Integers) -> Floats:
     """Longest edge of each simplex [m]."""
     longest = np.zeros(len(cells))

@@ -137,11 +137,12 @@ def load_body(path: Path, scale: float, limit: float | None = None) -> Body:
     shells = _blocks(raw, dimension - 1)
     cut = [simplices(corners(nodes, shape), shape) for _, shape, nodes in shells]
     facets, facet_tags, facet_sets = _marked(raw, shells, cut, tag_name, dimension - 1)
-    kept = flags[facets].all(axis=1)  # facets with a node that no cell uses belong to leftover geometry
-    return Body(
-        path, points[used], number[cells], cell_tags, number[facets[kept]],
-        None if facet_tags is None else facet_tags[kept], cell_sets, facet_sets, tuple(itertools.chain(*curved)),
-    )  # fmt: skip
+    if not flags.all():
+        points, cells = points[used], number[cells]
+        kept = flags[facets].all(axis=1)  # facets with a node that no cell uses belong to leftover geometry
+        facets, facet_tags = number[facets[kept]], None if facet_tags is None else facet_tags[kept]
+    notes = tuple(itertools.chain(*curved))
+    return Body(path, points, cells, cell_tags, facets, facet_tags, cell_sets, facet_sets, notes)
 
 
 def checked(body: Body, repair: bool, seam: float = SEAM) -> MeshArrays:
@@ -212,7 +213,7 @@ def _marked(
     """
     if not blocks:
         return np.zeros((0, dimension + 1), dtype=np.int64), None, {}
-    nodes = np.concatenate([part[0] for part in cut])
+    nodes = cut[0][0] if len(cut) == 1 else np.concatenate([part[0] for part in cut])
     tags = np.zeros(len(nodes), dtype=np.int64)
     values: list[int] = []
     if tag_name is not None:

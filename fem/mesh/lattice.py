@@ -12,15 +12,25 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise, permutations
+from itertools import pairwise, permutations, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from softgrasp.fem.compiled import functions
-from softgrasp.fem.mesh.check import SEAM, Facets, Flags, Floats, Integers, Ints, signed_volumes, sort_facets
+from softgrasp.fem.mesh.check import (
+    MOST_PAIRS,
+    SEAM,
+    Facets,
+    Flags,
+    Floats,
+    Integers,
+    Ints,
+    signed_volumes,
+    sizes_of,
+    sort_facets,
+)
 from softgrasp.fem.mesh.tissue_mesh import MeshArrays, inspected
 from softgrasp.fem.solve.differences import packed
 
@@ -30,6 +40,7 @@ if TYPE_CHECKING:
 INSIDE = 1e-6  # size of a nodal normal over that of its parts, below which the node is inside [1]: far above rounding
 NEAR_END = 0.3  # of a cell: an end of a box so near to another line needs none [1]
 LEAST = 0.1  # of its volume, which a cell keeps [1]
+PLACES, MOST_SHARES = 200, 6  # points a lattice cell that tell how full it is, and most of them along an edge [1]
 SAMPLE = 2000  # cells whose volumes give the lattice its edges, about [1]
 MOVES = 16  # attempts to move the corners, each by half as far around cells that would lose more
 
@@ -39,10 +50,12 @@ class LatticeCopy:
     """A body on lattice cells, and what both have of it."""
 
     arrays: MeshArrays  # the copy
+    outer: Integers  # nodes of its facets on the boundary, (n, d)
     ends: Flags  # nodes of the body that lie on its boundary, (n_points,)
     area: Floats  # surface of the body that goes with each node [m^(d-1)], (n_points,)
     volume: float  # of the copy over that of the body, less 1 [1]
     surface: float  # likewise of the boundary [1]
+    buried: float  # share of the boundary of the body, as that of a slit, that lies inside the copy [1]
     finer: float  # edge of a cell of the body over that of a cell of the copy, both of mean volume [1]
 
 
@@ -65,29 +78,24 @@ def lattice_copy(body: Body, most: int, boxes: Sequence[Any]) -> LatticeCopy | N
     fill, normals, parts, least = _measured(code, body, lines)
     area, volume = np.linalg.norm(normals, axis=1), float(fill.sum())
     ends = area > INSIDE * parts
-    corners, cells, marks = _filled(lines, fill)
+    full = _half_full(lines, fill)
+    corners, cells, marks = _cut(lines, fill, full)
     if not least > 0 or not len(cells):
         return None
     sides = sort_facets(cells)
-    tree = cKDTree(points[ends])
-    corners = _moved(corners, cells, np.unique(sides.nodes[sides.outer]), points[ends], tree, h)
-    facets, tags = _tagged(body, corners, sides, np.flatnonzero(ends), tree)
+    corners = _moved(corners, cells, np.unique(sides.nodes[sides.outer]), points[ends], h)
+    facets, tags = _tagged(body, corners, sides, np.flatnonzero(ends))
     known: dict[str, Any] = {"source": body.path.name, "notes": (), "digest": body.digest}
     known |= {"facet_sets": body.facet_sets, "cell_sets": body.cell_sets}
     arrays = inspected(
         (corners, cells, None if body.cell_tags is None else marks), (facets, tags), sides, known, SEAM, str(body.path)
     )
-    outer = sizes_of(corners, sides.nodes[sides.outer])
+    outer = sides.nodes[sides.outer]
+    surface = float(sizes_of(corners, outer).sum() / area[ends].sum()) - 1
+    buried = float(area[ends][_buried(lines, full, points[ends])].sum() / area[ends].sum())
     copied = float(signed_volumes(corners, cells).sum())
     finer = (volume / len(body.cells) / (copied / len(cells))) ** (1 / d)
-    return LatticeCopy(arrays, ends, area, copied / volume - 1, float(outer.sum() / area[ends].sum()) - 1, float(finer))
-
-
-def sizes_of(points: Floats, facets: Integers) -> Floats:
-    """Lengths or areas of facets (n, d), (n,) [m^(d-1)]."""
-    edges = points[facets[:, 1:]] - points[facets[:, :1]]
-    gram = np.linalg.det(edges @ edges.transpose(0, 2, 1))
-    return np.asarray(np.sqrt(gram) / math.factorial(edges.shape[1]))
+    return LatticeCopy(arrays, outer, ends, area, copied / volume - 1, surface, buried, float(finer))
 
 
 def _lines(low: float, high: float, ends: Sequence[float], h: float) -> Floats:
@@ -108,18 +116,39 @@ def _measured(code: Any, body: Body, lines: list[Floats]) -> tuple[Floats, Float
     fill, normals, parts = np.zeros((*count, marks)), np.zeros_like(points), np.zeros(len(points))
     least, every = np.full(1, np.inf), np.concatenate(lines)
     tags = None if body.cell_tags is None else np.ascontiguousarray(body.cell_tags)
-    arrays = (cells, points, tags, count, every, fill, normals, parts, least)
-    code.softgrasp_body(packed(len(cells), points.shape[1], marks, *arrays))
+    shares = _shares(points.shape[1], PLACES * count.prod() / len(cells))
+    arrays = (cells, points, tags, count, every, shares, fill, normals, parts, least)
+    code.softgrasp_body(packed(len(cells), points.shape[1], marks, len(shares), *arrays))
     return fill, normals, parts, float(least[0])
 
 
-def _filled(lines: list[Floats], fill: Floats) -> tuple[Floats, Integers, Ints]:
-    """Corners, simplices of positive volume, and their marks, of the lattice cells that are filled by half."""
-    d = len(lines)
+def _shares(d: int, least: float) -> Floats:
+    """Barycentric coordinates but the first of at least so many points spread over a simplex, (n, d)."""
+    q = next(q for q in range(MOST_SHARES) if math.comb(q + d, d) >= least or q == MOST_SHARES - 1)
+    steps = np.array([step for step in product(range(q + 1), repeat=d) if sum(step) <= q], dtype=np.float64)
+    return np.ascontiguousarray((steps + 1 / (d + 1)) / (q + 1))
+
+
+def _half_full(lines: list[Floats], fill: Floats) -> Flags:
+    """Whether each lattice cell is full by half or more."""
     size = np.diff(lines[0])
     for each in lines[1:]:
         size = np.multiply.outer(size, np.diff(each))
-    full = fill.sum(axis=-1) >= size / 2
+    return np.asarray(fill.sum(axis=-1) >= size / 2)
+
+
+def _buried(lines: list[Floats], full: Flags, places: Floats) -> Flags:
+    """Whether places lie in lattice cells that are full with all their neighbours."""
+    deep = np.pad(full, 1)
+    for axis in range(full.ndim):
+        deep = deep & np.roll(deep, 1, axis) & np.roll(deep, -1, axis)
+    cells = [np.searchsorted(each[1:-1], x, side="right") + 1 for each, x in zip(lines, places.T, strict=True)]
+    return np.asarray(deep[tuple(cells)])
+
+
+def _cut(lines: list[Floats], fill: Floats, full: Flags) -> tuple[Floats, Integers, Ints]:
+    """Corners, simplices of positive volume, and their marks, of the full lattice cells."""
+    d = len(lines)
     lowest, shape = np.argwhere(full), [len(each) for each in lines]
     cells = []
     for order in permutations(range(d)):
@@ -134,12 +163,22 @@ def _filled(lines: list[Floats], fill: Floats) -> tuple[Floats, Integers, Ints]:
     return corners, numbers.reshape(-1, d + 1).astype(np.int64), marks
 
 
-def _moved(corners: Floats, cells: Integers, outer: Integers, ends: Floats, tree: Any, h: float) -> Floats:
+def _nearest(points: Floats, places: Floats) -> Integers:
+    """Number of the point nearest to each place: SciPy's trees take longer to import."""
+    middle = points.mean(axis=0)
+    points, places = points - middle, places - middle
+    half = np.einsum("ij,ij->i", points, points) / 2
+    rows = max(MOST_PAIRS // len(points), 1)
+    parts = [np.argmin(half - places[k : k + rows] @ points.T, axis=1) for k in range(0, len(places), rows)]
+    return np.concatenate(parts)
+
+
+def _moved(corners: Floats, cells: Integers, outer: Integers, ends: Floats, h: float) -> Floats:
     """The corners, those on the boundary of the copy moved to the nearest node of that of the body."""
     before = signed_volumes(corners, cells)
-    distance, nearest = tree.query(corners[outer])
     step = np.zeros_like(corners)
-    step[outer] = np.where((distance < h)[:, None], ends[nearest] - corners[outer], 0.0)
+    step[outer] = ends[_nearest(ends, corners[outer])] - corners[outer]
+    step[np.linalg.norm(step, axis=1) > h] = 0.0
     share = np.ones(len(corners))
     for attempt in range(MOVES):
         moved = corners + share[:, None] * step
@@ -150,7 +189,7 @@ def _moved(corners: Floats, cells: Integers, outer: Integers, ends: Floats, tree
     return corners
 
 
-def _tagged(body: Body, corners: Floats, sides: Facets, ends: Integers, tree: Any) -> tuple[Integers, Ints | None]:
+def _tagged(body: Body, corners: Floats, sides: Facets, ends: Integers) -> tuple[Integers, Ints | None]:
     """Facets on the boundary of the copy, with the mark of the marked facets of the body nearest to each."""
     nodes = sides.nodes[sides.outer]
     if body.facet_tags is None:
@@ -160,5 +199,5 @@ def _tagged(body: Body, corners: Floats, sides: Facets, ends: Integers, tree: An
     inner = on[body.facets].all(axis=1)
     marks = np.full(len(body.points), -1, dtype=np.int32)
     marks[body.facets[inner]] = body.facet_tags[inner, None]
-    found = marks[ends[tree.query(corners[nodes].mean(axis=1))[1]]]
+    found = marks[ends[_nearest(body.points[ends], corners[nodes].mean(axis=1))]]
     return nodes[found >= 0], found[found >= 0]

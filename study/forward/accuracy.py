@@ -27,10 +27,14 @@ def check_estimated(scene: Scene) -> None:
         raise SceneError(f"{NOT_LINEAR}: leave out --certify, or set effects.finite_strain to false")
 
 
-def estimate_error(model: Model, budget: float | None = None) -> tuple[MeshEstimate | None, str]:
+def estimate_error(
+    model: Model, budget: float | None = None, cheapest: bool = False
+) -> tuple[MeshEstimate | None, str]:
     """The estimate of a model's mesh, or why there is none. Collective.
 
-    ``budget``: seconds of counted work (:mod:`softgrasp.fem.accuracy.price`) that it may take; None: any.
+    Args:
+        budget: seconds of counted work (:mod:`softgrasp.fem.accuracy.price`) that it may take; None: any.
+        cheapest: rather the cheapest than the best way within the budget.
     """
     if model.system.points is not None:  # the small models are of linear elasticity
         return None, f"{NOT_LINEAR}; with effects.finite_strain compare with a finer mesh and more steps."
@@ -38,7 +42,7 @@ def estimate_error(model: Model, budget: float | None = None) -> tuple[MeshEstim
         return None, f"{NOT_LINEAR} and small angles; with effects.frame compare with a finer mesh and more steps."
     if model.accuracy is not None:
         return model.accuracy, ""
-    plan = affordable(model, math.inf if budget is None else budget)
+    plan = affordable(model, math.inf if budget is None else budget, cheapest)
     if plan is None:
         least = min(plan.seconds for plan in plans(model))
         return None, f"The error of the mesh is not estimated: that would take about {least:.2g} s; --certify does it."

@@ -40,6 +40,7 @@ class Copy:
     text: str  # whose modes and sag are told, and how exact the sizes are, in sentences
     finer: float  # edges of the cells of the scene over those of the copy, the largest ratio [1]
     counted: bool = False  # whether the unknowns are counted; else computed
+    alike: bool = True  # whether singular ends and error of the mesh follow from it
 
 
 def build_seconds(scene: Scene) -> float:
@@ -48,7 +49,7 @@ def build_seconds(scene: Scene) -> float:
     Scenes are others too where a tolerance chooses the cells, and where a plan asks for the nodes of the mesh itself.
     """
     tissue, refine = scene.tissue, scene.tissue.refine
-    if not tissue.cells or scene._given is not None or _planned(scene):
+    if not tissue.cells or scene._given is not None or planned(scene):
         return 0.0
     d = len(tissue.cells)
     if refine is not None and not (by_lines(scene) and refine.tolerance is None and d * _lattice(scene) <= refine.most):
@@ -56,7 +57,7 @@ def build_seconds(scene: Scene) -> float:
     return BUILD[d, tissue.order] * box_simplices(tissue.cells)
 
 
-def _planned(scene: Scene) -> bool:
+def planned(scene: Scene) -> bool:
     """Whether a plan asks for the nodes of the mesh itself."""
     return scene.control is not None and scene.control.constraints is not None
 
@@ -70,22 +71,23 @@ def box_copy(scene: Scene, comm: MPI.Intracomm) -> Copy | None:
         return None
     pairs = zip(model.scene.tissue.cells or [], cells, strict=True)
     text = (
-        f"{NOT_ASSEMBLED}the same scene on coarser cells, n_e = {model.system.layout.n_e}. Sizes with about are computed from that copy, to 1 % of "
-        "the unknowns and 10 % of the non-zeros."
+        f"{NOT_ASSEMBLED}the same scene on coarser cells, n_e = {model.system.layout.n_e}. Sizes with about are "
+        "computed from that copy, to 1 % of the unknowns and 10 % of the non-zeros."
     )
     return Copy(model, sizes_from(model, scene), text, max(few / many for few, many in pairs))
 
 
-def cubic_copy(scene: Scene, comm: MPI.Intracomm) -> tuple[Copy | None, TissueMesh | None]:
+def cubic_copy(
+    scene: Scene, comm: MPI.Intracomm, mesh: TissueMesh | None = None
+) -> tuple[Copy | None, TissueMesh | None]:
     """Of cubic elements on cells that no box gives: quadratic ones there, which change frequencies by about 1 %.
 
-    None where these are as many as those of other copies or the cubic ones are few; then the mesh, if it was made.
-    Collective.
+    None where there are too many or few; and the mesh, if it was made or is given. Collective.
     """
     adaptive = scene.tissue.refine is not None and scene.tissue.refine.tolerance is not None
-    if scene.tissue.order < 3 or _planned(scene) or not (adaptive or scene.tissue.mesh):
-        return None, None
-    mesh = refined_mesh(comm, scene)
+    if scene.tissue.order < 3 or planned(scene) or not (adaptive or scene.tissue.mesh):
+        return None, mesh
+    mesh = mesh or refined_mesh(comm, scene)
     check_dimension(scene, d := mesh.dimension)
     layout = discretise(mesh, scene).layout
     if layout.n_e <= MOST_LOOKED_AT[d]:

@@ -44,6 +44,7 @@ from softgrasp.study.forward.cautions import (
     turned,
 )
 from softgrasp.study.forward.copies import LOOKED_AT, Copy, box_copy, build_seconds, coarser_copy, cubic_copy
+from softgrasp.study.forward.filed import file_copy
 from softgrasp.study.forward.result import ModelSizes, model_sizes, output_places
 from softgrasp.study.report import to_json
 from softgrasp.study.report.equation import Equation, equation
@@ -52,8 +53,7 @@ if TYPE_CHECKING:  # plans are not imported where a scene asks for none
     from softgrasp.lqr.design.constrained import PlanSizes
 
 MODES = 6
-ESTIMATE_SECONDS = 0.5  # a dearer estimate of the mesh is left to simulate,
-COPY_SECONDS = 0.3  # of a copy, whose estimate is extrapolated anyway, it is made on even fewer cells
+ESTIMATE_SECONDS = 0.5  # a dearer estimate of the mesh is left to simulate
 LARGE = 200_000  # cells beyond which rank 0 does not look for the ends
 BUILT_SECONDS = 0.1  # modelled time beyond which the sizes of a box are computed and nothing of it is assembled
 
@@ -153,7 +153,9 @@ def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
     if build_seconds(scene) > BUILT_SECONDS:
         copy, mesh = box_copy(scene, comm), None
     else:
-        copy, mesh = cubic_copy(scene, comm)
+        copy, mesh = file_copy(scene, comm)
+        if copy is None:
+            copy, mesh = cubic_copy(scene, comm, mesh)
     if copy is not None:
         return _explained(scene, copy.model, copy.sizes, copy=copy)
     return explain_model(build(scene, comm=comm, mesh=mesh, run=False))
@@ -252,7 +254,7 @@ def mesh_report(
     """Look for singular ends and estimate the error, that of a coarser copy where the mesh is large. Collective."""
     known = model or looked
     tissue, order, refine = known.space.mesh, scene.tissue.order, scene.tissue.refine
-    small = tissue.mesh.topology.index_map(tissue.dimension).size_global <= LARGE
+    small = tissue.mesh.topology.index_map(tissue.dimension).size_global <= LARGE and (copy is None or copy.alike)
     ends = scene_ends(known.system.layout.comm, tissue, known.scene) if small else None
     pairs = () if ends is None else zip(ends.kind, ends.alpha, strict=True)
     counts = Counter((kind, round(float(alpha), 3)) for kind, alpha in pairs)
@@ -261,8 +263,8 @@ def mesh_report(
     edges = graded and tissue.dimension == 3 and not by_lines(scene)
     converges = 2.0 * order if ends is None else expected_order(ends, order, graded, edges)
     error = None if model is None else estimate_error(model, ESTIMATE_SECONDS)[0]
-    if error is None and looked is not model and looked.scene.tissue.order == order:
-        found = estimate_error(looked, ESTIMATE_SECONDS if copy is None else COPY_SECONDS)[0]
+    if error is None and looked is not model and looked.scene.tissue.order == order and (copy is None or copy.alike):
+        found = estimate_error(looked, ESTIMATE_SECONDS, cheapest=True)[0]  # it is extrapolated anyway
         error = None if found is None else extrapolated(found, known, n_e)
     coarse = error is not None and error.by == "coarser"
     values = (

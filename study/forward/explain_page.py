@@ -34,7 +34,9 @@ def run_explain(
         f"{scene.name}: what it simulates", summary(explanation), sections(explanation), options=" --out out",
         errors=error_lines(explanation.mesh, explanation.effects["frame"].on), warnings=remarks(explanation),
     )  # fmt: skip
-    result = {"command": "explain", **origin(scene, session.comm.size), **explanation.to_dict()}
+    result = {}
+    if out is not None:  # hashing large files takes a while
+        result = {"command": "explain", **origin(scene, session.comm.size), **explanation.to_dict()}
     session.write(scene, result, lambda: page, clock=False)
     return explanation
 

@@ -1,0 +1,109 @@
+"""What explain says of a mesh file too large to be assembled, against the mesh itself."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.scene.file import load_scene
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.forward import copies, filed
+from softgrasp.study.forward.copies import node_pairs_of
+from softgrasp.study.forward.explain import explain
+from softgrasp.study.forward.explain_page import sections
+from tests.fem.mesh.test_lattice import cut_box
+
+
+def bar(comm: MPI.Intracomm, folder: Path, counts: list[int], order: int = 1, slit: bool = False) -> Scene:
+    """A bent bar in a mesh file, held at one end, perhaps slit along half of its length."""
+    if comm.rank == 0:
+        points, cells = cut_box(counts)
+        if slit:  # cells on one side have nodes of their own there
+            on = np.flatnonzero((points[:, 0] == 0.5) & (points[:, -1] > 0.5))
+            own = np.arange(len(points))
+            own[on] = len(points) + np.arange(len(on))
+            right = points[cells].mean(axis=1)[:, 0] > 0.5
+            cells[right] = own[cells[right]]
+            points = np.concatenate([points, points[on]])
+        points = points * ([0.1] * (len(counts) - 1) + [0.3])
+        points[:, 0] += 0.5 * points[:, -1] ** 2
+        meshio.write(folder / "bar.xdmf", meshio.Mesh(points, [("tetra" if len(counts) == 3 else "triangle", cells)]))
+    comm.Barrier()
+    d = len(counts)
+    return Scene.model_validate(
+        {
+            "name": "bar",
+            "tissue": {
+                "mesh": str(folder / "bar.xdmf"),
+                "order": order,
+                "material": {"young": 2e4, "poisson": 0.3, "rho": 1e3},
+            },
+            "contact": {"sides": ["yz"[d - 2] + "-"]},
+            "motion": {"target": [0.0] * (d - 1) + [0.1], "duration": 1.0},
+            "time": {"steps": 50},
+        }
+    )
+
+
+@pytest.mark.ranks(2)
+@pytest.mark.parametrize(("counts", "order"), [([24, 72], 2), ([4, 4, 12], 2)])
+def test_a_large_file_is_explained_by_a_copy_of_its_body(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch, counts: list[int], order: int
+) -> None:
+    """Sizes, modes, sag and hash against those of the assembled mesh."""
+    scene = bar(comm, mpi_tmp_path, counts, order)
+    monkeypatch.setattr(filed, "LARGE", {2: math.inf, 3: math.inf})
+    own, hashed = explain(scene, comm), scene_hash(scene)
+    monkeypatch.setattr(filed, "LARGE", {2: 1000, 3: 1000})
+    scene._mesh_digest = None
+    copied = explain(scene, comm)
+    assert (own.coarser, own.built) == (0, True)
+    assert (copied.built, copied.counted) == (False, False)
+    assert scene_hash(scene) == hashed
+    assert (copied.sizes.nodes, copied.sizes.cells) == (own.sizes.nodes, own.sizes.cells)
+    assert copied.sizes.n_e == pytest.approx(own.sizes.n_e, rel=0.01)
+    assert copied.sizes.nonzeros == pytest.approx(own.sizes.nonzeros, rel=0.05)  # in two digits
+    off = {2: 0.01, 3: 0.05}[own.dimension]  # measured 0.3 % and 2 %
+    np.testing.assert_allclose(copied.time.omega[:3], own.time.omega[:3], rtol=off)
+    assert copied.sag.largest == pytest.approx(own.sag.largest, rel=2 * off)  # measured 0.6 % and 6 %
+    assert [f.setup for f in copied.forecasts] == pytest.approx([f.setup for f in own.forecasts], rel=0.05)
+    assert copied.mesh.ends == ()  # those of lattice cells are not those of the body
+    (said,) = [part.text for part in sections(copied) if part.title == "Mesh"]
+    assert "a coarser copy of the body" in said
+
+
+def test_a_body_that_lattice_cells_do_not_show_is_assembled(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A slit, which lattice cells close, and which lets the first frequency fall."""
+    monkeypatch.setattr(filed, "LARGE", {2: 1000, 3: 1000})
+    scene = bar(comm, mpi_tmp_path, [10, 10, 20], slit=True)
+    assert explain(scene, comm).coarser == 0
+
+
+def test_cubic_elements_are_explained_by_quadratic_ones(comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene("pillow_3d")
+    copied = explain(scene, comm)
+    monkeypatch.setattr(copies, "MOST_LOOKED_AT", {3: 10**6})
+    own = explain(scene, comm)
+    assert own.coarser == 0
+    assert 0 < copied.coarser < own.sizes.n_e / 2
+    assert (copied.sizes.n_e, copied.sizes.nodes) == (own.sizes.n_e, own.sizes.nodes)
+    assert copied.sizes.nonzeros == pytest.approx(own.sizes.nonzeros, rel=0.05)  # in two digits
+    np.testing.assert_allclose(copied.time.omega, own.time.omega, rtol=0.02)  # measured 1.3 %
+    assert copied.sag.largest == pytest.approx(own.sag.largest, rel=0.02)  # measured 1.1 %
+    assert copied.mesh.ends == own.mesh.ends
+    assert copied.forecasts[0].setup == own.forecasts[0].setup
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_nodes_and_pairs_of_one_tetrahedron(order: int) -> None:
+    """All its nodes share it."""
+    nodes = math.comb(order + 3, 3)
+    assert node_pairs_of([4, 6, 4, 1], order) == (nodes, nodes**2)
