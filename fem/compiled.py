@@ -18,6 +18,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from softgrasp.fem.errors import SoftgraspWarning
+
 SHARED = Path(__file__).with_name("strain") / "law.h", Path(__file__).with_name("sum.h")  # any source may include them
 LANES = 8  # points that the C code treats at a time
 FLAGS = (f"-DLANES={LANES}", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
@@ -63,7 +65,7 @@ def _or_warn(load: Callable[[], Any], otherwise: str) -> Any:
         warnings.warn(
             f"{otherwise}, for want of compiled code ({''.join(reason)}); install cffi and a C compiler, or name one "
             "in CC",
-            RuntimeWarning,
+            SoftgraspWarning,
             stacklevel=4,
         )
         return None

@@ -53,6 +53,10 @@ class SoftgraspError(Exception):
         return one_line(super().__str__())
 
 
+class SoftgraspWarning(RuntimeWarning):
+    """What a user should know and no result carries, one sentence; commands write it without file and line."""
+
+
 class SceneError(SoftgraspError):
     """A scene key is missing, unknown, ill-typed or physically meaningless."""
 

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
-from softgrasp.fem.errors import shortened
+from softgrasp.fem.errors import SoftgraspWarning, shortened
 from softgrasp.reduction.system import ModelError
 
 Origin = Mapping[str, Any]
@@ -72,7 +72,7 @@ def check_origin(
     Raises ModelError: with the first key that differs.
     """
     if not origin:
-        warnings.warn(f"{name}: the model {UNKNOWN}", RuntimeWarning, stacklevel=3)
+        warnings.warn(f"{name}: the model {UNKNOWN}", SoftgraspWarning, stacklevel=3)
     elif difference := differing(origin, origin_of(keys), free):
         accepted = ("materials, " if MATERIAL in free else "") + "motions and times"
         raise ModelError(

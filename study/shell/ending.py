@@ -6,12 +6,15 @@ import os
 import sys
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from rich.console import Console
 from rich.text import Text
 
 from softgrasp.fem import SceneError, SoftgraspError, one_line
+from softgrasp.fem.errors import SoftgraspWarning
 from softgrasp.study.shell.streams import outlive_readers, write_utf8
 
 RANK = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK")  # set by launchers, known before MPI is loaded
@@ -81,10 +84,19 @@ def name_unused_options() -> None:
         )
 
 
+def write_warning(message: Warning | str, category: type[Warning], *place: Any, **options: Any) -> None:
+    """One sentence on rank 0 for a warning of this package, as for its errors; others with file and line."""
+    if not issubclass(category, SoftgraspWarning):
+        sys.stderr.write(warnings.formatwarning(message, category, *place[:2]))
+    elif rank() == 0:
+        sys.stderr.write(f"warning: {one_line(str(message))}\n")
+
+
 def run_command(command: Callable[[], object]) -> None:
     """Run a command line to its end. Collective."""
     outlive_readers()
     write_utf8()
+    warnings.showwarning = write_warning
     try:
         check_words(sys.argv)
         command()

@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +15,8 @@ import psutil
 import pytest
 from rich.console import Console
 
-from softgrasp.study.shell import doctor, processes
+from softgrasp.fem import compiled
+from softgrasp.study.shell import doctor, ending, processes
 
 
 def script(path: Path, text: str) -> str:
@@ -171,3 +174,24 @@ def wait_for(what: Callable[[], bool]) -> None:
     while not what():
         assert time.monotonic() < end
         time.sleep(0.02)
+
+
+def test_a_warning_of_the_package_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without a compiler a command says so as it says its errors; warnings of others keep their file and line."""
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(ending, "outlive_readers", lambda: None)  # pytest has no such streams
+    monkeypatch.setattr(ending, "write_utf8", lambda: None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+
+        def command() -> None:
+            compiled.functions.__wrapped__(Path("none.c"), "NumPy computes")
+            warnings.warn("of another", RuntimeWarning, stacklevel=1)
+
+        ending.run_command(command)
+    own, other, *_ = capsys.readouterr().err.splitlines()
+    assert own.startswith("warning: NumPy computes, for want of compiled code (there is no C compiler); install")
+    assert other.startswith(__file__)
