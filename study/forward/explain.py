@@ -223,10 +223,9 @@ def _explained(
             *small_obstacles(known, 1.0 if copy is None else copy.finer, scene.tissue.order),
             *away,
         ),
-    known = model or looked
-        outputs=output_places(looked if model is None else model),
+        outputs=output_places(known),
         memory=need(scene, d, sizes.cells, ranks, run=True),
-        forecasts=forecasts(looked, sizes.n_e, sizes.cells),
+        forecasts=forecasts(looked, scene, sizes.n_e, sizes.cells),
         snapshot_columns=columns,
         snapshot_bytes=16 * sizes.n_e * columns,
         mesh=mesh_report(scene, looked, sizes.n_e, model, copy),
