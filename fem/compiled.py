@@ -56,6 +56,17 @@ def functions(source: Path, otherwise: str) -> Any:
     return _or_warn(lambda: ctypes.CDLL(str(_shared(source, (), ()))), otherwise)
 
 
+def address(array: Any) -> Any:
+    """Where an array, which must stay alive, begins."""
+    return ctypes.c_void_p(array.__array_interface__["data"][0])
+
+
+def packed(*fields: int | Any | None) -> Any:
+    """A pointer to a struct of numbers (long) and arrays (pointers, None for 0) in C; the arrays must stay alive."""
+    numbers = [x if isinstance(x, int) else 0 if x is None else address(x).value for x in fields]
+    return ctypes.pointer((ctypes.c_longlong * len(fields))(*numbers))
+
+
 def _or_warn(load: Callable[[], Any], otherwise: str) -> Any:
     """What ``load`` returns; None, with a warning, where it cannot be compiled."""
     try:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem.compiled import functions
+from softgrasp.fem.compiled import functions, packed
 from softgrasp.fem.mesh.check import (
     MOST_PAIRS,
     SEAM,
@@ -32,7 +32,6 @@ from softgrasp.fem.mesh.check import (
     sort_facets,
 )
 from softgrasp.fem.mesh.tissue_mesh import MeshArrays, inspected
-from softgrasp.fem.solve.differences import packed
 
 if TYPE_CHECKING:
     from softgrasp.fem.mesh.file import Body

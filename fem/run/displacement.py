@@ -13,8 +13,9 @@ import ctypes
 import numpy as np
 from numpy.typing import NDArray
 
+from softgrasp.fem.compiled import address, packed
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.solve.differences import address, packed, product_code
+from softgrasp.fem.solve.differences import product_code
 
 
 def exact_sum(a: Array, b: Array) -> tuple[Array, Array]:

@@ -7,9 +7,10 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from softgrasp.fem.compiled import address
 from softgrasp.fem.petsc import Array, PETSc, rows_on_all
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
-from softgrasp.fem.solve.differences import address, product_code
+from softgrasp.fem.solve.differences import product_code
 
 ENTRIES = 1 << 20  # of a matrix that NumPy multiplies together, for little memory
 

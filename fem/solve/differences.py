@@ -10,7 +10,6 @@ half the memory of K. A step multiplies with -2 K, and CG over vertex stars with
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from softgrasp.fem.compiled import functions
+from softgrasp.fem.compiled import address, functions, packed
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc, to_scipy
 from softgrasp.fem.solve.cholesky import Dissection
@@ -44,17 +43,6 @@ def require_same_code(comm: MPI.Intracomm) -> None:
             f"rank {without[0]} finds neither a C compiler nor what others have compiled; install one on every "
             "machine, name it in CC, or let XDG_CACHE_HOME be a folder that all of them can read and write"
         )
-
-
-def address(array: Any) -> Any:
-    """Where an array, which must stay alive, begins."""
-    return ctypes.c_void_p(array.__array_interface__["data"][0])
-
-
-def packed(*fields: int | Any | None) -> Any:
-    """A pointer to a struct of numbers (long) and arrays (pointers, None for 0) in C; the arrays must stay alive."""
-    numbers = [x if isinstance(x, int) else 0 if x is None else address(x).value for x in fields]
-    return ctypes.pointer((ctypes.c_longlong * len(fields))(*numbers))
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,11 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from softgrasp.fem.compiled import address
 from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.layout import Patches
 from softgrasp.fem.petsc import Array, PETSc
-from softgrasp.fem.solve.differences import address, product_code
+from softgrasp.fem.solve.differences import product_code
 
 Single = NDArray[np.float32]
 BYTES = 2**26  # memory of the stars that are inverted at once [byte]
