@@ -48,6 +48,9 @@ REPEATED_RANKS = 4
 # Unknowns from which ranks factor a subtree each in 2D: a solve with 1e5 takes 6.9 ms on two ranks, 11.3 on one, and
 # 12.7 where both have the whole factor; below, the messages and the sum of a step take as long.
 SUBTREES_FROM = 10_000
+# Time of their set-up on two ranks, which eliminates twice, over that of one factor [1]: 1.2 with 1e5 unknowns on free
+# cores, 1.9 to 2.3 with 1e4 to 4e5 beside other work.
+SUBTREES_SETUP = 1.3
 SUBTREES_MEMORY = 4.5  # memory of their set-up over that of one factor [1]: 4.4 and 4.8 with 1e5 and 4e5 unknowns
 
 
@@ -83,7 +86,7 @@ COSTS: dict[tuple[SolverName, int, int], Cost] = {
     ("mumps", 3, 2): Cost((12.8, 2.0), (0.144, 4 / 3), (10_600, 1 / 3), 3e5, fixed=0.033, messages=100),
     ("cg", 3, 1): Cost((1.6, 1.15), (0.029, 1.15), (900, 0.0), np.inf, iterations=(9, 9.6), messages=22),
     ("cg", 3, 2): Cost((2.4, 1.22), (0.058, 1.2), (1200, 0.0), np.inf, iterations=(16, 16), messages=22),
-    ("stars", 3, 2): Cost((1.3, 1.2), (0.040, 1.17), (2600, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
+    ("stars", 3, 2): Cost((1.3, 1.2), (0.040, 1.17), (1700, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
     ("cg", 3, 3): Cost((2.0, 1.0), (0.06, 1.0), (1100, 0.0), np.inf, iterations=(16, 27), messages=22),
     ("stars", 3, 3): Cost((4.0, 1.05), (0.084, 1.08), (6500, 0.0), np.inf, iterations=(7.4, 3.75), messages=110),
 }
@@ -138,7 +141,8 @@ class Work:
     def setup(self, name: SolverName) -> float:
         """Modelled time of the set-up [s]."""
         cost = self._cost(name)
-        return cost.fixed + self._time(cost.setup, name) + self._waits(name)
+        again = SUBTREES_SETUP * 2**PARALLEL if self.split(name) else 1.0
+        return cost.fixed + again * self._time(cost.setup, name) + self._waits(name)
 
     def solve(self, name: SolverName) -> float:
         """Modelled time of one solve [s]."""
