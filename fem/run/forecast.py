@@ -20,7 +20,7 @@ from softgrasp.fem.solve.stiffness import resting_solves
 if TYPE_CHECKING:
     from softgrasp.fem.run.contact.expected import ExpectedContact
 
-TYPICAL, WORST = 1.3, 2.5  # factors of `python -m benchmarks scale`, the geometric mean and the largest, of whole runs
+TYPICAL, WORST = 1.3, 2.4  # factors of `python -m benchmarks scale`, the geometric mean and the largest, of whole runs
 START = 3.0  # time of every command: imports, page and pictures of a small run [s]
 LIBRARIES = 160.0 * 2**20  # memory of the libraries on each rank [byte]
 PRODUCTS = 2  # products of a step beside its solve, those of its vectors included [1]
