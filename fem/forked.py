@@ -47,7 +47,7 @@ class Forked[T]:
         if answer is None:
             self.end()
             raise OSError("the other process was lost")
-        kind, self._value = _unpacked(answer, self.same)
+        kind, self._value = unpacked(answer, self.same)
         if kind == "raised":
             self.end()
             raise self._value
@@ -127,19 +127,20 @@ def _work(here: Connection, there: Connection, call: Callable[[Pause], Any], sam
     gc.disable()  # what belongs to PETSc and MPI is not this process's to free
 
     def pause(value: Any = None) -> Any:
-        there.send_bytes(_packed(("paused", value), same))
+        there.send_bytes(packed(("paused", value), same))
         return there.recv()
 
     try:
-        packed = _packed(("done", call(pause)), same)
+        answer = packed(("done", call(pause)), same)
     except (EOFError, BrokenPipeError):  # nobody waits
         return
     except Exception as error:
-        packed = _packed(("raised", error), ())
-    there.send_bytes(packed)
+        answer = packed(("raised", error), ())
+    there.send_bytes(answer)
 
 
-def _packed(result: object, same: Sequence[object]) -> bytes:
+def packed(result: object, same: Sequence[object]) -> bytes:
+    """A result without the objects of ``same``, for another process."""
     places = {id(each): i for i, each in enumerate(same)}
 
     class Packer(pickle.Pickler):
@@ -151,9 +152,11 @@ def _packed(result: object, same: Sequence[object]) -> bytes:
     return file.getvalue()
 
 
-def _unpacked(packed: bytes, same: Sequence[object]) -> Any:
+def unpacked(sent: bytes, same: Sequence[object]) -> Any:
+    """The result of :func:`packed`, with the objects of ``same`` of this process."""
+
     class Unpacker(pickle.Unpickler):
         def persistent_load(self, pid: Any) -> object:
             return same[pid]
 
-    return Unpacker(io.BytesIO(packed)).load()
+    return Unpacker(io.BytesIO(sent)).load()

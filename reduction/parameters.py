@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -104,11 +105,29 @@ def thinned(snapshots: Snapshots, count: int) -> Snapshots:
     return snapshots.columns(np.unique(np.linspace(0, m - 1, min(count, m)).round().astype(int)))
 
 
-def training_states(own: FullRun, parameters: Sequence[tuple[float, float]]) -> States:
-    """Snapshots of the scene's own run and of runs at these, altogether as many as the own run has. Collective."""
+Each = Callable[[Sequence[Callable[[], Snapshots]]], list[Snapshots]]
+"""Makes several calls."""
+
+
+def in_order(calls: Sequence[Callable[[], Snapshots]]) -> list[Snapshots]:
+    """Results of the calls, one after the other."""
+    return [call() for call in calls]
+
+
+def training_states(
+    own: FullRun,
+    parameters: Sequence[tuple[float, float]],
+    each: Each = in_order,
+) -> States:
+    """Snapshots of the scene's own run and of runs at these, altogether as many as the own run has. Collective.
+
+    ``each``: makes the runs; ranks with the whole model each may divide them.
+    """
     system, count = own.model.system, -(-own.snapshots.Z.shape[1] // (1 + len(parameters)))
-    runs = [(system, thinned(own.snapshots, count))]
-    for lam, mu in parameters:
-        other = run_at(own.model, lam, mu)
-        runs.append((other.model.system, thinned(other.snapshots, count)))
-    return States(system, tuple(runs))
+
+    def made(lam: float, mu: float) -> Snapshots:
+        return thinned(run_at(own.model, lam, mu).snapshots, count)
+
+    others = each([partial(made, *place) for place in parameters])
+    systems = [system.with_materials(materials_at(own.model, *place)) for place in parameters]
+    return States(system, ((system, thinned(own.snapshots, count)), *zip(systems, others, strict=True)))

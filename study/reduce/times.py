@@ -10,8 +10,10 @@ from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
+from mpi4py import MPI
 
 from softgrasp.fem import Model, RunOptions, Stopwatch, Trajectory, simulate
+from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.reduction import FullRun, full_run
 from softgrasp.study.report import Columns, percent
 from softgrasp.study.shell import RepeatableRun, processor_seconds
@@ -103,18 +105,25 @@ class Turns:
         return f"{error}; the times scatter too much to name a speed-up ({again}, at a new parameter {new}: {how})."
 
 
-def in_turn(model: Model, again: Callable[[], object], new: Callable[[], object]) -> Turns:
-    """Full model and reduced one in turn: ``again`` a run, ``new`` a new parameter and its run. Collective."""
+def in_turn(
+    model: Model, again: Callable[[], object], new: Callable[[], object], ranks: MPI.Intracomm = MPI.COMM_SELF
+) -> Turns:
+    """Full model and reduced one in turn: ``again`` a run, ``new`` a new parameter and its run. Collective.
+
+    ``ranks``: that divide the rounds, with the whole model each.
+    """
     comm = model.system.layout.comm
     for call in (again, new):
         call()  # what is made once
     samples: list[tuple[float, float]] = []
     rounds = ROUNDS
-    while len(samples) < rounds:
-        factor, steps = _full_seconds(model)
-        runs = [processor_seconds(comm, partial(_often, call)) / OFTEN for call in (again, new)]
-        samples.append((steps / runs[0], (factor + steps) / runs[1]))
-        rounds = comm.bcast(ROUNDS if factor + steps < PATIENCE else FULL_REPEATS)
+    with raise_on_all_ranks(ranks):
+        while len(samples) * ranks.size < rounds:
+            factor, steps = _full_seconds(model)
+            runs = [processor_seconds(comm, partial(_often, call)) / OFTEN for call in (again, new)]
+            samples.append((steps / runs[0], (factor + steps) / runs[1]))
+            rounds = comm.bcast(ROUNDS if factor + steps < PATIENCE else FULL_REPEATS)
+    samples = [sample for part in ranks.allgather(samples) for sample in part]
     spreads = [Spread(*np.quantile(x, (0.25, 0.5, 0.75)).tolist()) for x in zip(*samples, strict=True)]
     return Turns(spreads[0], spreads[1], len(samples))
 
@@ -134,12 +143,18 @@ def _full_seconds(model: Model) -> tuple[float, float]:
     return factor, steps
 
 
-def measured_run(model: Model, say: Say) -> tuple[FullRun, FullTimes]:
-    """The full run, and its processor time in the median of several when it is short. Collective."""
-    comm = model.system.layout.comm
-    first = simulate(model, RunOptions(progress=lambda run: say("full run", run.reached, run.steps)))
-    repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
-    factor, steps = map(statistics.median, zip(*(_full_seconds(model) for _ in range(repeats)), strict=True))
+def measured_run(model: Model, say: Say, ranks: MPI.Intracomm = MPI.COMM_SELF) -> tuple[FullRun, FullTimes]:
+    """The full run, and its processor time in the median of several when it is short. Collective.
+
+    ``ranks``: that divide the repeats, with the whole model each.
+    """
+    comm, times = model.system.layout.comm, list[tuple[float, float]]()
+    with raise_on_all_ranks(ranks):
+        first = simulate(model, RunOptions(progress=lambda run: say("full run", run.reached, run.steps)))
+        repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
+        times = [_full_seconds(model) for _ in range(-(-repeats // ranks.size))]
+    every = [each for part in ranks.allgather(times) for each in part]
+    factor, steps = map(statistics.median, zip(*every, strict=True))
     return full_run(model, first), FullTimes(steps, factor)
 
 

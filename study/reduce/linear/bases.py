@@ -79,22 +79,26 @@ def small(states: States) -> bool:
     return bool(0 < size <= WHOLE_BYTES)
 
 
-def two_shares(names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Methods for two processes with about equal work; those that share a tall factor stay together."""
+def shares_of(names: Sequence[str], count: int = 2) -> list[list[str]]:
+    """Methods for processes or ranks with about equal work; those that share a tall factor stay together."""
     groups: dict[object, list[str]] = {}
     for name in names:
         method = registry.find_method(name)
         groups.setdefault((method.snapshots, method.coordinates, method.frame, method.inner), []).append(name)
-    if len(groups) == 1:
-        return list(names[::2]), list(names[1::2])
+    if len(groups) < count:
+        return [list(names[i::count]) for i in range(count)]
 
-    def work(share: Sequence[str]) -> int:  # pairs have twice the columns, and several decompositions
-        methods = [registry.find_method(name) for name in share]
-        return sum(3 if method.pairs and method.snapshots else 1 for method in methods)
+    def work(group: Sequence[str]) -> int:  # about seconds with 6558 unknowns: a tall factor, and all sizes of a method
+        methods = [registry.find_method(name) for name in group]
+        several = [method.pairs and method.snapshots for method in methods]  # pairs have twice the columns
+        return 3 * several[0] + 2 * methods[0].snapshots + sum(2 + each for each in several)
 
-    shares: tuple[list[str], list[str]] = [], []
+    shares: list[list[str]] = [[] for _ in range(count)]
+    sums = [0] * count
     for group in sorted(groups.values(), key=work, reverse=True):
-        min(shares, key=work).extend(group)
+        least = sums.index(min(sums))
+        shares[least] += group
+        sums[least] += work(group)
     return shares
 
 

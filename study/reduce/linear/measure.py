@@ -7,6 +7,7 @@ import statistics
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,8 @@ from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.propagator import Propagator
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
-from softgrasp.study.reduce.linear.bases import Made, bases_of, made_apart, small, two_shares
+from softgrasp.study.reduce.linear.bases import Made, bases_of, made_apart, shares_of, small
+from softgrasp.study.reduce.linear.ranks import dealt
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
     LARGER,
@@ -191,12 +193,16 @@ def sweep(
 
 
 def sweep_all(
-    names: Sequence[str], full: FullRun, say: Say, options: Reduction | None = None
+    names: Sequence[str],
+    full: FullRun,
+    say: Say,
+    options: Reduction | None = None,
+    ranks: MPI.Intracomm = MPI.COMM_SELF,
 ) -> tuple[MethodSweep, ...]:
     """Every method at all N of the options, None for those of the scene. Collective.
 
     On one rank with a free core a forked process makes and measures the bases of some of the methods. Times are taken
-    afterwards, by one process at a time.
+    afterwards, by one process at a time. ``ranks``: that divide the methods, with the whole run each.
     """
     options = options or full.model.scene.reduction
     size = len(options.N)
@@ -204,7 +210,8 @@ def sweep_all(
     with suppress(BasisError):  # each method states what is wrong with the snapshots
         states = condensed(every)
     made = made_apart([(name, options.N) for name in names], states, options)
-    own, beside = two_shares(names) if len(names) > 1 and small(states) else (list(names), [])
+    same = full.model.system.layout, *map(registry.find_method, names)
+    own, beside = shares_of(names) if len(names) > 1 and small(states) and ranks.size == 1 else (list(names), [])
 
     def one(name: str, tell: Say) -> Untimed:
         def progress(done: int, of: int) -> None:
@@ -218,9 +225,14 @@ def sweep_all(
         pause(None)
         return [half.timed(full) for half in halves]
 
-    other = forked(share, (full.model.system.layout, *map(registry.find_method, beside))) if beside else None
+    def whole(share: Sequence[str]) -> list[MethodSweep]:
+        return [one(name, say).timed(full) for name in share]
+
+    other = forked(share, same) if beside else None
     if other is None:
-        return tuple(one(name, say).timed(full) for name in names)
+        parts = shares_of(names, ranks.size) if ranks.size > 1 else [list(names)]
+        sweeps = [s for found in dealt(ranks, [partial(whole, part) for part in parts], same) for s in found]
+        return tuple(sorted(sweeps, key=lambda s: names.index(s.method.key)))
     with other:
         halves = [one(name, say) for name in own]
         try:
@@ -232,21 +244,28 @@ def sweep_all(
     return tuple(sorted(sweeps, key=lambda s: names.index(s.method.key)))
 
 
-def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | None) -> list[TestedModel]:
+def box_models(
+    full: FullRun, sweeps: Sequence[MethodSweep], states: States | None, ranks: MPI.Intracomm = MPI.COMM_SELF
+) -> list[TestedModel]:
     """Models of the best methods at two N: those of the sweep, and from ``states`` with the same N. Collective."""
     outputs, options, models = full.model.outputs, full.model.scene.reduction, []
     tested = [s for s, _ in by_error(sweeps)[:METHODS_TESTED]]
     sizes = [sorted({p.N for N in (COMPARED, LARGER) if (p := nearest(s.points, N)) is not None}) for s in tested]
     tasks = [(s.method.key, own) for s, own in zip(tested, sizes, strict=True)]
     made = made_apart(tasks, states, options) if states else {}
-    for s, wanted in zip(tested, sizes, strict=True):
-        own = [s.models[N] for N in wanted]
-        models += [TestedModel(s.method, False, model) for model in own]
+
+    def trained(s: MethodSweep, wanted: list[int]) -> list[ReducedModel]:
         if states is None or not s.method.snapshots:
-            continue
+            return []
         bases, *_ = made.get(s.method.key) or bases_of(s.method.key, states, wanted, options, {})
-        several = [project_scene(b, full.model, outputs) for b, _ in zip(bases, own, strict=False)]
-        models += [TestedModel(s.method, True, model) for model in several]
+        return [project_scene(b, full.model, outputs) for b, _ in zip(bases, wanted, strict=False)]
+
+    same = full.model.system.layout, *(s.method for s in tested)
+    order = sorted(range(len(tested)), key=lambda i: not (tested[i].method.pairs and tested[i].method.snapshots))
+    every = dealt(ranks, [partial(trained, tested[i], sizes[i]) for i in order], same)  # the longest first
+    for i, (s, wanted) in enumerate(zip(tested, sizes, strict=True)):
+        models += [TestedModel(s.method, False, s.models[N]) for N in wanted]
+        models += [TestedModel(s.method, True, model) for model in every[order.index(i)]]
     return models
 
 
@@ -283,34 +302,50 @@ def errors_at(
 
 
 def measure_box(
-    full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress = lambda done, of: None
+    full: FullRun,
+    sweeps: Sequence[MethodSweep],
+    progress: Progress = lambda done, of: None,
+    ranks: MPI.Intracomm = MPI.COMM_SELF,
 ) -> DomainTests:
-    """Train, and test over the box. Collective. Raises SolverError: a run failed. ResourceError: no memory."""
+    """Train, and test over the box. Collective. Raises SolverError: a run failed. ResourceError: no memory.
+
+    ``ranks``: that divide runs and methods, with the whole run each.
+    """
     scene = full.model
     reason = outside(scene) or ("" if by_error(sweeps) else "no method has a stable model")
     if reason:
         return DomainTests(none=reason)
     first, training, grid = scene.system.materials[0], training_of(scene), grid_of(scene)
-    models = box_models(full, sweeps, training_states(full, training) if training else None)
+    each = partial(dealt, ranks, same=(scene.system.layout,))
+    models = box_models(full, sweeps, training_states(full, training, each) if training else None, ranks)
     trained_at = ((first.lam, first.mu), *training)
     known = families(full, models)
-    own, points = errors_at(full, models, known), []
-    for k, (lam, mu) in enumerate(grid):
+
+    def at(k: int) -> tuple[float, ...]:
         progress(k, len(grid))
-        trained = any(np.allclose((lam, mu), place) for place in trained_at)
-        place = run_at(scene, lam, mu)
-        points.append(BoxPoint(lam, mu, trained, errors_at(place, models, moved(known, place))))
+        place = run_at(scene, *grid[k])
+        return errors_at(place, models, moved(known, place))
+
+    calls: list[Callable[[], tuple[float, ...]]] = [partial(at, k) for k in range(len(grid))]
+    *errors, own = dealt(ranks, [*calls, lambda: errors_at(full, models, known)])
+    points = [
+        BoxPoint(lam, mu, any(np.allclose((lam, mu), place) for place in trained_at), found)
+        for (lam, mu), found in zip(grid, errors, strict=True)
+    ]
     tests, summary = [p for p in points if not p.trained] or points, []
     for i, m in enumerate(models):
-        errors = [p.errors[i] for p in tests]
+        seen = [p.errors[i] for p in tests]
         runs = len(trained_at) if m.several else int(m.method.snapshots)
-        largest = max(errors, key=lambda e: (not np.isfinite(e), e))
-        summary.append(BoxErrors(m.method.key, m.model.N, runs, own[i], statistics.median(errors), largest))
+        largest = max(seen, key=lambda e: (not np.isfinite(e), e))
+        summary.append(BoxErrors(m.method.key, m.model.N, runs, own[i], statistics.median(seen), largest))
     return DomainTests(tuple(models), tuple(points), tuple(summary), trained_at if training else (), box_of(scene))
 
 
-def headline_turns(full: FullRun, sweeps: Sequence[MethodSweep]) -> Turns | None:
-    """Full model and the most accurate stable reduced one in turn; None without any. Collective."""
+def headline_turns(full: FullRun, sweeps: Sequence[MethodSweep], ranks: MPI.Intracomm = MPI.COMM_SELF) -> Turns | None:
+    """Full model and the most accurate stable reduced one in turn; None without any. Collective.
+
+    ``ranks``: that divide the rounds.
+    """
     if not (chosen := by_error(sweeps)):
         return None
     s, p = chosen[0]
@@ -322,7 +357,7 @@ def headline_turns(full: FullRun, sweeps: Sequence[MethodSweep]) -> Turns | None
         again, inputs = replay_inputs(model, small, full)
         run(again, allow_unstable=not small.stable, **inputs)
 
-    return in_turn(full.model, lambda: run(step, **drive), new)
+    return in_turn(full.model, lambda: run(step, **drive), new, ranks)
 
 
 def speed_notes(n_e: int, steps: int, full: FullTimes, sweeps: Sequence[MethodSweep]) -> tuple[str, ...]:

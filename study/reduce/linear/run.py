@@ -17,34 +17,39 @@ from softgrasp.study.pictures import draw_in_background
 from softgrasp.study.pull.page import pull_page
 from softgrasp.study.reduce.linear import measure
 from softgrasp.study.reduce.linear.page import compose, findings
+from softgrasp.study.reduce.linear.ranks import of_each_rank
 from softgrasp.study.reduce.linear.result import MethodSweep, ReductionStudy, best, by_error
 from softgrasp.study.reduce.linear.views import gather_views
 from softgrasp.study.reduce.times import FullTimes, measured_run
+from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.shell import Session
 
 
 def run_linear(session: Session, scene: Scene, names: Sequence[str]) -> dict[str, Any]:
     """Reduce the scene by the methods of these names, and write the results. Collective."""
-    model, watch = session.model(scene), Stopwatch(session.comm)
+    watch = Stopwatch(session.comm)
+    model, ranks = of_each_rank(session.model(scene), scene)
     with session.counting("full run") as say:
         with watch.stage("full"):
-            full, times = measured_run(model, say)
+            full, times = measured_run(model, say, ranks)
         with watch.stage("sweep"):
-            sweeps = measure.sweep_all(names, full, say)
+            sweeps = measure.sweep_all(names, full, say, ranks=ranks)
         drawn = begin_to_draw(session, full, times, sweeps)
         with watch.stage("box"):
-            box = measure.measure_box(full, sweeps, partial(say, "other parameters"))
+            box = measure.measure_box(full, sweeps, partial(say, "other parameters"), ranks)
         with watch.stage("turns"):
-            turns = measure.headline_turns(full, sweeps)
+            turns = measure.headline_turns(full, sweeps, ranks)
     notes = measure.speed_notes(model.system.layout.n_e, scene.time.steps, times, sweeps)
     study = ReductionStudy(full, sweeps, times, box, turns, findings(sweeps), notes)
     chosen = [(s, p) for s in study.sweeps if (p := best(s.points)) is not None]
     models = [session.out / "models" / f"{s.method.key}.h5" for s, _ in chosen]
     with watch.stage("models"):
         for file, (s, p) in zip(models, chosen, strict=True):
-            save(s.models[p.N], file)
+            with raise_on_all_ranks(ranks):
+                if ranks.rank == 0:
+                    save(s.models[p.N], file)
     pulled = write_pull(session, study)
-    result = study.result(watch.seconds)
+    result = study.result(watch.seconds) | {"ranks": session.comm.size, "memory_peak_mb": peak_memory_mb(session.comm)}
 
     session.write(scene, result, lambda: compose(study, drawn(), models, pulled))
     return result
@@ -65,7 +70,7 @@ def write_pull(session: Session, study: ReductionStudy) -> Path | None:
     if not session.comm.bcast(page != ""):
         return None
     with raise_on_all_ranks(session.comm):
-        if page:
+        if page and session.comm.rank == 0:
             note(file)
             file.write_text(page, encoding="utf-8")
     return file

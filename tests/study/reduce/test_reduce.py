@@ -21,9 +21,12 @@ from softgrasp.reduction.bases.states import States, states_of
 from softgrasp.reduction.parameters import training_of, training_states
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, full_run, replay_linear
+from softgrasp.reduction.system import ModelError
 from softgrasp.study.reduce.linear import measure
 from softgrasp.study.reduce.linear.bases import bases_of, made_apart
-from softgrasp.study.reduce.linear.measure import FURTHER, box_models, measure_box, sweep, untimed
+from softgrasp.study.reduce.linear.measure import FURTHER, box_models, headline_turns, measure_box, sweep, untimed
+from softgrasp.study.reduce.linear.ranks import dealt, of_each_rank
+from softgrasp.study.reduce.times import measured_run
 from tests.helpers.models import gather_matrix, gather_rows, gather_states, make_scene
 
 PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"
@@ -210,6 +213,54 @@ def test_every_rank_count_gives_the_same(small: FullRun) -> None:
             for key in ("error", "error_canonical", "error_deformation", "error_energy", "projection_error"):
                 # rounding of the snapshots over the gap of the singular values
                 assert getattr(p, key) == pytest.approx(getattr(q, key), rel=1e-5), (name, key)
+
+
+@pytest.mark.ranks
+def test_ranks_with_the_whole_model_each_divide_the_work(comm: MPI.Intracomm) -> None:
+    """Every number but the times has the bits of one rank, and an error of one rank is raised on all."""
+    names, N = ("pod_fixed", "psd_fixed", "craig_bampton"), [8, 14, 4000]
+    model = build(load_scene(PAPER, [*SMALL, "reduction.train=[[100, 60], [20, 80]]"]), comm=comm)
+    whole, ranks = of_each_rank(model, model.scene)
+    assert (whole is model) == (comm.size == 1)
+    assert (whole.system.layout.comm.size, ranks.size) == (1, comm.size)
+    large = model.scene.model_copy(update={"time": model.scene.time.model_copy(update={"steps": 10**6})})
+    assert of_each_rank(model, large) == (model, MPI.COMM_SELF)
+
+    def studied(among: MPI.Intracomm) -> Any:
+        full, _ = measured_run(whole, lambda *_: None, among)
+        sweeps = measure.sweep_all(names, full, lambda *_: None, wanted(full, N), among)
+        box, turns = measure_box(full, sweeps, ranks=among), headline_turns(full, sweeps, among)
+        assert turns is not None
+        assert turns.rounds >= 9
+        numbers = [
+            {key: value for key, value in asdict(p).items() if not key.startswith("time")}
+            for s in sweeps
+            for p in s.points
+        ]
+        kept = [
+            (s.method.key, N, *m.reconstruct(m.at(), np.eye(m.N), np.zeros((2, m.N))))
+            for s in sweeps
+            for N, m in s.models.items()
+        ]
+        return (
+            numbers,
+            [s.refused for s in sweeps],
+            [p.errors for p in box.points],
+            [asdict(e) for e in box.summary],
+            kept,
+        )
+
+    one, many = studied(MPI.COMM_SELF), studied(ranks)
+    assert one[:4] == many[:4]
+    for alone, shared in zip(one[4], many[4], strict=True):
+        assert alone[:2] == shared[:2]
+        assert all(np.array_equal(a, b) for a, b in zip(alone[2:], shared[2:], strict=True))
+
+    def failing() -> None:
+        raise ModelError("no run")
+
+    with pytest.raises(ModelError, match="no run"):
+        dealt(ranks, [*([lambda: None] * (comm.size - 1)), failing])
 
 
 @pytest.mark.ranks
