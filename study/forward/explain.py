@@ -190,10 +190,7 @@ def _explained(
         key: EffectReport(e.active(scene), e.term, e.operators(scene), e.cost, e.gate(problem))
         for key, e in EFFECTS.items()
     }
-    stored = scene.output.snapshots in ("auto", "memory")
-    columns = scene.time.steps // scene.output.every + 1 if stored else 0
-    if scene.output.snapshots == "auto":
-        columns = len(spread(columns, looked_at(sizes.n_e)))
+    columns = _snapshot_columns(scene, sizes.n_e)
     dt = scene.time_end / scene.time.steps
     poisson = poisson_ratios(small)
     copied = "" if copy is None else copy.text
@@ -236,6 +233,12 @@ def _explained(
         dimension=d,
         plan=None if model is None else _plan(model),
     )
+
+
+def _snapshot_columns(scene: Scene, n_e: int) -> int:
+    """Number of states that a run keeps in memory."""
+    columns = scene.time.steps // scene.output.every + 1 if scene.output.snapshots in ("auto", "memory") else 0
+    return len(spread(columns, looked_at(n_e))) if scene.output.snapshots == "auto" else columns
 
 
 def _plan(model: Model) -> PlanSizes | None:
