@@ -58,7 +58,7 @@ void softgrasp_jump(const Flat *f, double *v);
 int softgrasp_stop(Flat *f);
 """
 RUB_DECLARATIONS = """
-void softgrasp_matrix(Rub *f);
+int softgrasp_matrix(Rub *f);
 void softgrasp_begin(Rub *f, int where, int known);
 int softgrasp_rub(Rub *f, int begin, int rounds);
 void softgrasp_sweep(Rub *f, int sweeps, double still);

@@ -265,8 +265,8 @@ class Coulomb(Rounds):
 
     def _factor(self) -> None:
         """The factor of the matrix of the present sets."""
-        self.code[1].softgrasp_matrix(self.f)
-        if n := int(self.f.size):  # else all is known
+        done = self.code[1].softgrasp_matrix(self.f)
+        if (n := int(self.f.size)) and not done:  # without unknowns all is known
             matrix = self.LU[: n * n].reshape(n, n).T
             lu, self.pivot[:n], _ = (sgetrf if self.f.single else dgetrf)(matrix, overwrite_a=True)
             if not np.shares_memory(lu, self.LU):

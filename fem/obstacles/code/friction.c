@@ -202,9 +202,11 @@ static void begin_round(Rub *f) {
 static int descend(Rub *f) {
   const int K = f->k * (1 + f->m), n = f->n, wide = f->single ? 4 : 8;
   double *u = f->room;
-  const double step = wide * (0.5 * n * K + (double)n * n) / READ, factor = CALL + 2.0 / 3 * n * n * n / FLOPS * wide / 4;
+  double step = wide * (0.5 * n * K + (double)n * n) / READ, factor = CALL + 2.0 / 3 * n * n * n / FLOPS * wide / 4;
+  if (little(f, n)) step += EACH, factor = 8.0 * n * K / READ + 2.0 / 3 * n * n * n / SLOWER;
   while (f->left > f->target && f->taken < KEPT) {
-    if (!f->rows || f->slips0 != f->slips || (f->age && f->work > factor)) return WANTED;
+    if ((!f->rows || f->slips0 != f->slips || (f->age && f->work > factor && !fits(f))) && !(little(f, n) && softgrasp_matrix(f)))
+      return WANTED;
     double *z = f->Z + (size_t)f->taken * K, *c = f->C + (size_t)f->taken * K, *v = f->V + (size_t)f->taken * K;
     f->work += step;
     f->age++;

@@ -32,6 +32,8 @@ enum { KEPT = 24, DRIFTS = 3, PATIENCE = 25 }; /* steps of a round, refinements 
 static const double RIDGE_SINGLE = 1e-7; /* as RIDGE, of a factor in single precision */
 static const double READ = 2e10, FLOPS = 5e10, CALL = 3e-5; /* bytes and operations per second, seconds of a call: what
                                                                steps and factors cost in proportion */
+enum { LITTLE = 64 };                             /* unknowns up to which factors are made in C */
+static const double EACH = 1e-6, SLOWER = 5e9;    /* then: seconds of a step beside, operations per second */
 
 typedef struct {
   int k, m, ld;              /* nodes, tangents, columns of W */
@@ -143,8 +145,41 @@ static void times(const Rub *f, int exact, const double *u, double *v, float *ro
   for (int r = 0; r < K; r++) v[r] = room[K + r];
 }
 
-/* The matrix of the present sets by rows, into LU. */
-void softgrasp_matrix(Rub *f) {
+/* Whether the factor is that of the present sets, in 2D. */
+static int fits(const Rub *f) {
+  if (f->m > 1 || f->slips0 != f->slips) return 0;
+  for (int i = 0; i < f->k; i++)
+    if (f->kind[i] != f->kind0[i] || (f->kind[i] == SLIP && f->e[2 * i] != f->e0[2 * i])) return 0;
+  return 1;
+}
+
+/* Whether factors are made here: of few slips. */
+static int little(const Rub *f, int n) { return f->slips && !f->single && n <= LITTLE; }
+
+/* The factor of LU in place, with the pivots of LAPACK. */
+static void eliminate(int n, double *LU, int *pivot) {
+  for (int k = 0; k < n; k++) {
+    double *column = LU + (size_t)k * n;
+    int p = k;
+    for (int i = k + 1; i < n; i++)
+      if (fabs(column[i]) > fabs(column[p])) p = i;
+    pivot[k] = p;
+    for (int j = 0; p != k && j < n; j++) {
+      const double t = LU[(size_t)j * n + k];
+      LU[(size_t)j * n + k] = LU[(size_t)j * n + p];
+      LU[(size_t)j * n + p] = t;
+    }
+    for (int i = k + 1; i < n; i++) column[i] /= column[k];
+    for (int j = k + 1; j < n; j++) {
+      double *to = LU + (size_t)j * n;
+      const double t = to[k];
+      for (int i = k + 1; i < n; i++) to[i] -= t * column[i];
+    }
+  }
+}
+
+/* The matrix of the present sets by rows, into LU; whether it is factored there. */
+int softgrasp_matrix(Rub *f) {
   const int s = 1 + f->m, K = f->k * s, ld = f->slips ? K : f->ld;
   const double *M = f->slips ? f->inverse : f->W;
   double *v = f->room, *row = v + K, of_v[3], of_u[3];
@@ -169,6 +204,8 @@ void softgrasp_matrix(Rub *f) {
       for (int j = 0; j < f->k; j++) to += shorten(f, f->slips, j, f->kind[j], f->e + j * s, v + j * s, to);
       for (int j = 0; f->single && j < f->size; j++) f->LU_single[(size_t)r * f->size + j] = (float)row[j];
     }
+  if (little(f, f->size)) eliminate(f->size, f->LU, f->pivot);
+  return little(f, f->size);
 }
 
 /* z: unknowns that the rows g ask for if the sets were those of the factor; those of other sets from their own node. */
