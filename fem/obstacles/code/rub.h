@@ -33,7 +33,7 @@ static const double RIDGE_SINGLE = 1e-7; /* as RIDGE, of a factor in single prec
 static const double READ = 2e10, FLOPS = 5e10, CALL = 3e-5; /* bytes and operations per second, seconds of a call: what
                                                                steps and factors cost in proportion */
 enum { LITTLE = 64 };                             /* unknowns up to which factors are made in C */
-static const double EACH = 1e-6, SLOWER = 5e9;    /* then: seconds of a step beside, operations per second */
+static const double EACH = 4e-6, SLOWER = 5e9;    /* then: seconds of a step beside, operations per second */
 
 typedef struct {
   int k, m, ld;              /* nodes, tangents, columns of W */
