@@ -84,7 +84,7 @@ def lattice_copy(body: Body, most: int, boxes: Sequence[Any]) -> LatticeCopy | N
     sides = sort_facets(cells)
     corners = _moved(corners, cells, np.unique(sides.nodes[sides.outer]), points[ends], h)
     facets, tags = _tagged(body, corners, sides, np.flatnonzero(ends))
-    known: dict[str, Any] = {"source": body.path.name, "notes": (), "digest": body.digest}
+    known: dict[str, Any] = {"source": body.path.name, "notes": body.notes, "digest": body.digest}
     known |= {"facet_sets": body.facet_sets, "cell_sets": body.cell_sets}
     arrays = inspected(
         (corners, cells, None if body.cell_tags is None else marks), (facets, tags), sides, known, SEAM, str(body.path)

@@ -9,18 +9,22 @@ from mpi4py import MPI
 from softgrasp.fem import Model, Scene, build
 from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.forked import packed, unpacked
+from softgrasp.fem.model.memory import need
 from softgrasp.study.reduce.linear.bases import WHOLE_BYTES
+
+MODEL_BYTES = 2.0**30  # of matrices and factor of one model up to which each rank holds them
 
 
 def of_each_rank(model: Model, scene: Scene) -> tuple[Model, MPI.Intracomm]:
     """The model on each rank alone, and the ranks that divide work; where its run is large, itself and no others.
 
-    Large are runs whose states do not fit on each rank, and graded meshes, which are estimated while they are made.
-    Collective.
+    Large are runs with more states or larger matrices than each rank shall hold, and graded meshes, which are estimated
+    while they are made. Collective.
     """
     layout = model.system.layout
-    states = 16 * layout.n_e * (scene.time.steps + 1)
-    if layout.comm.size == 1 or states > WHOLE_BYTES or scene.tissue.refine is not None:
+    states, held = 16 * layout.n_e * (scene.time.steps + 1), need(scene, layout.dimension, model.cells, 1, True)
+    large = states > WHOLE_BYTES or held.of(1.0, 1) > MODEL_BYTES
+    if layout.comm.size == 1 or large or scene.tissue.refine is not None:
         return model, MPI.COMM_SELF
     with raise_on_all_ranks(layout.comm):
         own = build(scene, comm=MPI.COMM_SELF)

@@ -13,6 +13,7 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
+from softgrasp.fem.model.memory import Need
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
@@ -216,7 +217,7 @@ def test_every_rank_count_gives_the_same(small: FullRun) -> None:
 
 
 @pytest.mark.ranks
-def test_ranks_with_the_whole_model_each_divide_the_work(comm: MPI.Intracomm) -> None:
+def test_ranks_with_the_whole_model_each_divide_the_work(comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every number but the times has the bits of one rank, and an error of one rank is raised on all."""
     names, N = ("pod_fixed", "psd_fixed", "craig_bampton"), [8, 14, 4000]
     model = build(load_scene(PAPER, [*SMALL, "reduction.train=[[100, 60], [20, 80]]"]), comm=comm)
@@ -225,6 +226,9 @@ def test_ranks_with_the_whole_model_each_divide_the_work(comm: MPI.Intracomm) ->
     assert (whole.system.layout.comm.size, ranks.size) == (1, comm.size)
     large = model.scene.model_copy(update={"time": model.scene.time.model_copy(update={"steps": 10**6})})
     assert of_each_rank(model, large) == (model, MPI.COMM_SELF)
+    with monkeypatch.context() as patch:  # as of a fine mesh in 3D with few steps: 2 GB of factor, 0.2 GB of states
+        patch.setattr("softgrasp.study.reduce.linear.ranks.need", lambda *_: Need(0.5e9, 2e9, 0.0))
+        assert of_each_rank(model, model.scene) == (model, MPI.COMM_SELF)
 
     def studied(among: MPI.Intracomm) -> Any:
         full, _ = measured_run(whole, lambda *_: None, among)
