@@ -40,6 +40,7 @@ INSIDE = 1e-6  # size of a nodal normal over that of its parts, below which the 
 NEAR_END = 0.3  # of a cell: an end of a box so near to another line needs none [1]
 LEAST = 0.1  # of its volume, which a cell keeps [1]
 PLACES, MOST_SHARES = 200, 6  # points a lattice cell that tell how full it is, and most of them along an edge [1]
+MOST_FILLS = 10_000_000  # numbers that tell how full each lattice cell is of each mark: 80 MB [1]
 SAMPLE = 2000  # cells whose volumes give the lattice its edges, about [1]
 MOVES = 16  # attempts to move the corners, each by half as far around cells that would lose more
 
@@ -61,6 +62,8 @@ class LatticeCopy:
 def lattice_copy(body: Body, most: int, boxes: Sequence[Any]) -> LatticeCopy | None:
     """The body on at most about so many lattice cells; None without compiled code, or where a cell is inverted.
 
+    None too of a thin body that lies across the box around it, where most lattice cells are empty.
+
     ``boxes``: [low, high] of zones and layers, whose ends lattice lines shall meet.
     """
     code = functions(Path(__file__).with_name("body.c"), "large mesh files are assembled to explain them")
@@ -74,11 +77,14 @@ def lattice_copy(body: Body, most: int, boxes: Sequence[Any]) -> LatticeCopy | N
     if not h > 0:
         return None
     lines = [_lines(low[k], high[k], [x for box in boxes for x in (box[0][k], box[1][k])], h) for k in range(d)]
-    fill, normals, parts, least = _measured(code, body, lines)
+    marks = 1 if body.cell_tags is None else int(body.cell_tags.max()) + 1
+    if marks * math.prod(len(each) - 1 for each in lines) > MOST_FILLS:
+        return None
+    fill, normals, parts, least = _measured(code, body, lines, marks)
     area, volume = np.linalg.norm(normals, axis=1), float(fill.sum())
     ends = area > INSIDE * parts
     full = _half_full(lines, fill)
-    corners, cells, marks = _cut(lines, fill, full)
+    corners, cells, cell_marks = _cut(lines, fill, full)
     if not least > 0 or not len(cells):
         return None
     sides = sort_facets(cells)
@@ -86,9 +92,8 @@ def lattice_copy(body: Body, most: int, boxes: Sequence[Any]) -> LatticeCopy | N
     facets, tags = _tagged(body, corners, sides, np.flatnonzero(ends))
     known: dict[str, Any] = {"source": body.path.name, "notes": body.notes, "digest": body.digest}
     known |= {"facet_sets": body.facet_sets, "cell_sets": body.cell_sets}
-    arrays = inspected(
-        (corners, cells, None if body.cell_tags is None else marks), (facets, tags), sides, known, SEAM, str(body.path)
-    )
+    own = corners, cells, None if body.cell_tags is None else cell_marks
+    arrays = inspected(own, (facets, tags), sides, known, SEAM, str(body.path))
     outer = sides.nodes[sides.outer]
     surface = float(sizes_of(corners, outer).sum() / area[ends].sum()) - 1
     buried = float(area[ends][_buried(lines, full, points[ends])].sum() / area[ends].sum())
@@ -107,10 +112,9 @@ def _lines(low: float, high: float, ends: Sequence[float], h: float) -> Floats:
     return np.concatenate([[low], *(np.linspace(a, b, max(round((b - a) / h), 1) + 1)[1:] for a, b in gaps)])
 
 
-def _measured(code: Any, body: Body, lines: list[Floats]) -> tuple[Floats, Floats, Floats, float]:
+def _measured(code: Any, body: Body, lines: list[Floats], marks: int) -> tuple[Floats, Floats, Floats, float]:
     """Volume by lattice cell and mark, nodal normals, size of their parts, and the least volume of a cell."""
     points, cells = np.ascontiguousarray(body.points), np.ascontiguousarray(body.cells)
-    marks = 1 if body.cell_tags is None else int(body.cell_tags.max()) + 1
     count = np.array([len(each) - 1 for each in lines], dtype=np.int64)
     fill, normals, parts = np.zeros((*count, marks)), np.zeros_like(points), np.zeros(len(points))
     least, every = np.full(1, np.inf), np.concatenate(lines)

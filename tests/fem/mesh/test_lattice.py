@@ -97,3 +97,11 @@ def test_no_copy_of_inverted_cells_or_without_a_compiler(monkeypatch: pytest.Mon
     assert lattice_copy(body(points, cells[:, [0, 2, 1]]), 16, ()) is None
     monkeypatch.setattr("softgrasp.fem.mesh.lattice.functions", lambda *_: None)
     assert lattice_copy(body(points, cells), 16, ()) is None
+
+
+def test_no_copy_of_a_thin_body_across_the_box_around_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rod along the diagonal, of 1e-3 of its length: 2e8 lattice cells, all but a few hundred of them empty."""
+    points, cells = cut_box([2, 2, 40])
+    points = points * [1e-3, 1e-3, 1.0]
+    monkeypatch.setattr("softgrasp.fem.mesh.lattice._measured", lambda *_: pytest.fail("they are filled"))
+    assert lattice_copy(body(points + points[:, 2:] * [1, 1, 0], cells), 250, ()) is None
