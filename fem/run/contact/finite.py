@@ -91,10 +91,10 @@ class FiniteContact(Contact):
             self.after = self._gaps(x1, n + 1)
             new = (self.after < -tol) & ~known
             reached = np.abs(self.after[at])[pressed].max(initial=0.0)
-            if not new.any() and reached <= tol:
+            if self.after.min() >= -tol and reached <= tol:
                 return f, rows.take(pressed)
             known |= new
-        raise unsettled(float(reached))
+        raise unsettled(max(float(reached), -float(self.after.min())))
 
     def _strengths(self, rows: Rows, m: int) -> Array:
         """Strengths (m,) of the responses in the forces of rows."""

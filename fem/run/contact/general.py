@@ -202,13 +202,13 @@ class Contact:
             new = (after < -tol) & ~known
             pressed = rows.x > 0
             reached = np.abs(after[rows.obstacle, rows.node])[pressed].max(initial=0.0)
-            if not new.any() and reached <= tol:
+            if after.min() >= -tol and reached <= tol:  # rows without force too: their normals turn
                 self.after = after
                 return f, rows.take(pressed)
             known |= new
             active[:] = False
             active[rows.obstacle[pressed], rows.node[pressed]] = True
-        raise unsettled(float(reached))
+        raise unsettled(max(float(reached), -float(after.min())))
 
     def _correction(self, f: Array) -> Array:
         """Motion of the boundary nodes over the step by forces f, (p, d) [m]."""

@@ -42,6 +42,11 @@ SLANTED = (
 )
 
 
+FRUSTUM = [[-0.03, -0.03, -0.03], [0.04, -0.03, -0.03], [0.04, 0.03, -0.03], [-0.03, 0.03, -0.03],
+           [-0.02, -0.02, -2e-4], [0.03, -0.02, -2e-4], [0.03, 0.02, -2e-4], [-0.02, 0.02, -2e-4]]  # fmt: skip
+BLUNT = ["kind='box', lo=[-0.02, -0.02, -0.03], hi=[0.03, 0.02, -2e-4]", f"kind='polyhedron', points={FRUSTUM}"]
+
+
 def run(*overrides: str, **options: Any) -> Any:
     return simulate(build("paper_forward", [*SMALL, ON, *overrides]), **options)
 
@@ -274,6 +279,26 @@ def test_three_dimensions_and_higher_orders_close_their_balance() -> None:
         assert result.contact.touching.max() > 0
         assert result.energy_drift < 1e-12  # rounding
         assert result.contact.penetration < 1e-13
+
+
+@pytest.mark.ranks(2)
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize("shape", BLUNT)
+def test_nodes_that_pass_an_edge_within_a_step_stay_outside(shape: str, friction: float) -> None:
+    """Their normals turn from face to face between the rounds, also of nodes that carry no force."""
+    result = simulate(
+        build(
+            "block_3d",
+            ["tissue.cells=[3, 3, 3]", "tissue.order=1", "tissue.refine=false", ON, "time={steps=30, end=0.3}",
+             "time.start='rest'", "effects.rotation=false", "effects.reaction=false",
+             "effects.gravity={g=[0, 0, -9.81]}",
+             "motion={profile='quintic', target=[0.02, 0.01, -0.001], duration=0.3}",
+             f"obstacle=[{{{shape}, friction={friction}}}]"],
+        )
+    )  # fmt: skip
+    assert result.contact.touching.max() > 3
+    assert result.energy_drift < 1e-13  # rounding: measured 3e-15
+    assert result.contact.penetration < 1e-14  # of a body of 0.05 m: rounding of its places
 
 
 def test_the_force_on_a_prescribed_hand_takes_in_the_contact() -> None:
