@@ -22,7 +22,7 @@ from matplotlib.tri import Triangulation
 
 from softgrasp.fem import Array, PictureMesh
 from softgrasp.study.pictures import shapes, style
-from softgrasp.study.pictures.plate import around_bodies, hand_plate, held_facets
+from softgrasp.study.pictures.plate import around_bodies, hand_plate, held_facets, path_hidden
 from softgrasp.study.pictures.shapes import MoveView
 from softgrasp.study.pictures.style import colour_map, length_unit, paper_style, pressure_unit, save
 
@@ -66,13 +66,17 @@ def make_view(
         from softgrasp.study.pictures.obstacles import extent  # few scenes have any
 
         box = extent(picture.obstacles, times, room, box)
-    low, high = box
+    low, high, apart = *box, np.zeros(0, dtype=int)
     pressure = 0.0 if tractions is None else float(np.linalg.norm(tractions, axis=2).max())
+    if tractions is not None and pressure > 0 and picture.dimension == 3:
+        from softgrasp.study.pictures.obstacles import far_apart
+
+        apart = far_apart(picture, tractions)
     lines = [] if aim is None else outline(picture, picture.points + picture.rigid(aim))
     edges = [picture.facets, shapes.interfaces(picture)] if picture.dimension == 2 else [np.zeros((0, 2), dtype=int)]
     return MoveView(
         picture, states, times, hands, tractions if pressure > 0 else None, pressure, room, path, norm, unit, low, high,
-        polygons, np.vstack(edges), lines,
+        polygons, np.vstack(edges), lines, apart,
     )  # fmt: skip
 
 
@@ -228,9 +232,9 @@ def legend(figure: Any, move: MoveView) -> None:
         entries.append(Patch(color=style.HAND, label="hand"))
     if filled and not move.norm.vmax > 0:
         entries.append(Patch(color=colour_map()(0.0), label="tissue, not deformed"))
-    if np.ptp(move.path, axis=0).max() > 0:
+    if np.ptp(move.path, axis=0).max() > 0 and not path_hidden(move):
         entries.append(Line2D([], [], ls=DASHES, color=style.OUTLINE, lw=0.9, label="path of the hand"))
-    if move.tractions is not None and move.picture.dimension == 2:
+    if move.tractions is not None:
         factor, unit = pressure_unit(move.pressure)
         label = f"pressure, at most {factor * move.pressure:.3g} {unit}"
         entries.append(Line2D([], [], ls="", marker=r"$\rightarrow$", ms=9, color=style.HAND, label=label))

@@ -9,8 +9,9 @@ import numpy as np
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
 
-from softgrasp.fem import Array, Ball, HalfSpace, Obstacle, Polytope, Shape
+from softgrasp.fem import Array, Ball, HalfSpace, Obstacle, PictureMesh, Polytope, Shape
 from softgrasp.study.pictures import shapes
 from softgrasp.study.pictures.shapes import MoveView
 from softgrasp.study.pictures.style import HAND, OUTLINE
@@ -25,6 +26,7 @@ BEYOND = 0.15  # of the scene, by which the drawn part of a plane in space is wi
 MARGIN = np.array([0.07, 0.025])  # of a name to the frame, over the diagonal of the picture [1]
 SHOWN = 2000  # points of the bodies that a name in space keeps clear of [1]
 LEAST = 0.02  # shortest arrow that is drawn, over the longest
+ARROWS, RANKED = 40, 400  # most arrows of an instant in space, and of all instants together
 
 
 def draw_obstacle(ax: Any, shape: Shape, name: str, box: Array, shift: Array | float = 0.0) -> None:
@@ -71,7 +73,7 @@ def extent(obstacles: tuple[Obstacle, ...], times: Array, room: Array, box: Arra
 
 
 def draw_surroundings(ax: Any, move: MoveView, numbers: list[int]) -> None:
-    """Obstacles at instants of a move, those at rest once, and in the plane arrows of the pressure on each body."""
+    """Obstacles at instants of a move, those at rest once, and arrows of the pressure on each body."""
     solid = move.picture.dimension == 3
     box = np.array([ax.get_xlim(), ax.get_ylim()]).T
     for obstacle in move.picture.obstacles:
@@ -81,17 +83,39 @@ def draw_surroundings(ax: Any, move: MoveView, numbers: list[int]) -> None:
                 _name_solid(ax, faces, obstacle, box, move)
             else:
                 draw_obstacle(ax, obstacle.shape, obstacle.name, box, obstacle.shift(move.times[k]))
-    if move.tractions is None or solid:
+    if move.tractions is None:
         return
+    scale = LONGEST * float(np.ptp(move.picture.points, axis=0).min()) / move.pressure
     for k in numbers:
-        x, load = move.picture.points + move.states[k], move.tractions[k]
-        size = np.linalg.norm(load, axis=1)
-        on = size > LEAST * move.pressure
-        if on.any():
-            arrows = load[on] * (LONGEST * float(np.ptp(move.picture.points, axis=0).min()) / move.pressure)
+        pressed = np.flatnonzero(_sizes(move.tractions[k]) > LEAST * move.pressure)
+        on = move.apart[np.isin(move.apart, pressed)][:ARROWS] if solid else pressed
+        if len(on):
+            x, arrows = move.picture.points[on] + move.states[k][on], scale * move.tractions[k][on]
             look: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1, "pivot": "tip", "units": "inches"}
-            head = {"headwidth": 4.0, "headlength": 5.0, "headaxislength": 4.5}
-            ax.quiver(*x[on].T, *arrows.T, color=HAND, width=0.012, zorder=6, **look, **head)
+            look |= {"headwidth": 4.0, "headlength": 5.0, "headaxislength": 4.5, "width": 0.012, "zorder": 6}
+            if solid:  # seen before body and hand alike
+                look |= {"path_effects": [withStroke(linewidth=1.2, foreground="white")]}
+            ax.quiver(*shapes.seen(x).T, *shapes.seen(arrows).T, color=HAND, **look)
+
+
+def far_apart(picture: PictureMesh, tractions: Array) -> NDArray[np.intp]:
+    """Vertices pressed at some instant: the first under the largest pressure, each next farthest from those before.
+
+    Of those pressed at an instant, the first ones have its arrows: few move from frame to frame of a film.
+    ``tractions`` as in `MoveView`, (k, n, d) [Pa].
+    """
+    size = _sizes(tractions).max(axis=0)
+    pressed = np.flatnonzero(size > LEAST * size.max())
+    x, chosen = picture.points[pressed], [int(size[pressed].argmax())]
+    gap = np.full(len(x), np.inf)
+    while len(chosen) < min(len(x), RANKED):
+        gap = np.minimum(gap, np.linalg.norm(x - x[chosen[-1]], axis=1))
+        chosen.append(int(gap.argmax()))
+    return np.asarray(pressed[chosen])
+
+
+def _sizes(tractions: Array) -> Array:
+    return np.asarray(np.linalg.norm(tractions, axis=-1))
 
 
 def polygons(shape: Shape, shift: Array, room: Array) -> tuple[list[Array], list[float]]:

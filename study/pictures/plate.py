@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softgrasp.fem import Array, PictureMesh
-from softgrasp.study.pictures.shapes import facet_normals, seen, view_direction
+from softgrasp.study.pictures.shapes import MoveView, facet_normals, seen, view_direction
 
 THICK = 0.09  # of the smallest side of the body
 PAD = 0.04  # of the frame, free around the body
+PLACES = 40  # of the path, at which it is looked for
 WIDE = 0.16  # the same with obstacles, for the part of a plane that is drawn
 
 
@@ -53,3 +54,25 @@ def around_bodies(picture: PictureMesh, states: Array, hands: Array) -> list[tup
         boxes.append((points.min(axis=0), points.max(axis=0)))
     half = (0.5 + (WIDE if picture.obstacles else PAD)) * np.max([high - low for low, high in boxes], axis=0)
     return [((low + high) / 2 - half, (low + high) / 2 + half) for low, high in boxes]
+
+
+def path_hidden(move: MoveView) -> bool:
+    """Whether the path of the hand lies behind the body and the hand, where they start and where they end, in 3D."""
+    picture = move.picture
+    if picture.dimension == 2:
+        return False
+    path = seen(move.path[np.linspace(0, len(move.path) - 1, PLACES).round().astype(int)])
+    for u, q in ((move.states[i], move.hands[i]) for i in (0, -1)):
+        plate = [polygon for side in hand_plate(picture, q) for polygon in side]
+        halves = [polygon[[0, k, k + 1]] for polygon in plate for k in range(1, len(polygon) - 1)]
+        triangles = seen(np.concatenate([(picture.points + u)[picture.facets], np.reshape(halves, (-1, 3, 3))]))
+        if not all(_inside(x, triangles).any() for x in path):
+            return False
+    return True
+
+
+def _inside(x: Array, triangles: Array) -> NDArray[np.bool_]:
+    """Which triangles (m, 3, 2) of the plane a point (2,) lies in."""
+    edge, off = np.roll(triangles, -1, axis=1) - triangles, x - triangles
+    side = edge[..., 0] * off[..., 1] - edge[..., 1] * off[..., 0]
+    return np.asarray((side >= 0).all(axis=1) | (side <= 0).all(axis=1))

@@ -33,6 +33,7 @@ class MoveView:
     hand: list[Array]  # polygons of the hand where it starts, each (corners, d); empty in 3D
     edges: Any  # outline and interfaces of layers in 2D, shape (m, 2); empty in 3D
     aim: list[Array]  # closed lines around the body at the target in the plane of the picture, each (k, 2) [m]
+    apart: Any  # numbers of pressed vertices of a 3D body in the order in which they get arrows
 
     def values(self, displacement: Array, q_s: Array) -> Array:
         """|u - R q_s| at the vertices in the unit of the colour bar, shape (n,)."""
