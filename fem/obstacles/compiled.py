@@ -22,9 +22,9 @@ KINDS = {
 DEFINED = (f"RIDGE={RIDGE!r}", f"RETRIES={RETRIES}")
 
 
-def compiled(source: Path, declaration: str) -> Any:
+def compiled(source: Path, declaration: str, *defined: str) -> Any:
     """(ffi, library) of a source that includes `dense.h`, or None with a warning where it cannot be compiled."""
-    return library(source, declaration, "contact is solved in NumPy, more slowly", HEADERS, DEFINED)
+    return library(source, declaration, "contact is solved in NumPy, more slowly", HEADERS, DEFINED + defined)
 
 
 def contact_library() -> Any:
@@ -32,9 +32,9 @@ def contact_library() -> Any:
     return compiled(SOURCE, _struct("swept.h", "Swept") + _struct("flat.h", "Flat") + DECLARATIONS)
 
 
-def friction_library() -> Any:
-    """See `compiled`, of `friction.c`."""
-    return compiled(CODE / "friction.c", _struct("rub.h", "Rub") + RUB_DECLARATIONS)
+def friction_library(tangents: int) -> Any:
+    """See `compiled`, of `friction.c` for nodes with so many tangents."""
+    return compiled(CODE / "friction.c", _struct("rub.h", "Rub") + RUB_DECLARATIONS, f"TANGENTS={tangents}")
 
 
 def _struct(header: str, name: str) -> str:
@@ -64,6 +64,6 @@ int softgrasp_rub(Rub *f, int begin, int rounds);
 void softgrasp_sweep(Rub *f, int sweeps, double still);
 double softgrasp_wrong(Rub *f);
 int softgrasp_stays(const void *flat, const int *rows, int count);
-void softgrasp_jolt(const void *flat, const Rub *step, const int *rows, const double *A, Rub *jolt);
+void softgrasp_jolt(const void *flat, const Rub *step, const int *rows, Rub *jolt);
 int softgrasp_jolted(const void *flat, const Rub *step, const int *rows, const Rub *jolt);
 """

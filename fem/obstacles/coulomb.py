@@ -55,7 +55,7 @@ class Coulomb(Rounds):
 
     def __init__(self, tangents: int, engine: str = "", inverse: Inverse | None = None) -> None:
         self.m, self.inverse = tangents, inverse or Inverse()
-        self.code: Any = None if engine == "NumPy" else friction_library()
+        self.code: Any = None if engine == "NumPy" else friction_library(tangents)
         self.tally = np.zeros(3, np.int64)
         self.arrays = dict[str, NDArray[Any]]()
         self.f: Any = None if self.code is None else self.code[0].new("Rub *")
@@ -84,11 +84,11 @@ class Coulomb(Rounds):
         self._use(self.m > 1 and k >= SINGLE)
         self._point(
             before=self.before, before_y=self.before_y, x=x, y=y, kind=kind, e=e, pivot=self.pivot, kind0=self.kind0,
-            q=self.q, mu=self.mu, e0=self.e0, solved=np.zeros(K), lacks=np.zeros(K), Z=np.zeros((KEPT, K)),
+            q=self.q, base=np.zeros(K), mu=self.mu, e0=self.e0, solved=np.zeros(K), lacks=np.zeros(K), Z=np.zeros((KEPT, K)),
             C=np.zeros((KEPT, K)), V=np.zeros((KEPT, K)), follows=np.zeros(K), room=np.zeros(8 * K),
             seen=np.zeros((ROUNDS[self.m], k), np.int8), tally=self.tally,
         )  # fmt: skip
-        self.f.k, self.f.m, self.f.rows, self.f.slips, self.f.had = k, self.m, 0, 0, 0
+        self.f.k, self.f.rows, self.f.slips, self.f.had, self.f.based = k, 0, 0, 0, 0
 
     def _use(self, single: bool) -> None:
         """Room for a factor in single precision or in double."""
@@ -230,7 +230,9 @@ class Coulomb(Rounds):
     def _describe(self, W: Array, q: Array, mu: Array, tol: float) -> None:
         """Let the struct have the problem."""
         self.inverse.of(W, len(q))
-        self.q[:], self.mu[:], self.f.tol = q, mu, tol
+        if q is not self.q:
+            self.q[:], self.f.based = q, 0
+        self.mu[:], self.f.tol = mu, tol
         if W is not self.arrays.get("W"):
             self._point(W=W)
             self.f.rows, self.f.ld = 0, W.shape[1]

@@ -5,16 +5,32 @@
 
 static const double NEAR = 0.2, EXACT = 1e-14; /* by how much a round reduces its residual, in 3D and in 2D */
 
-/* y = W x + q. */
+/* y = W x + q, or W (x - base) + q. */
 static void evaluate(const Rub *f) {
-  const int K = f->k * (1 + f->m);
-  times_in_double(K, f->ld, f->W, f->x, f->y);
+  const int K = f->k * (1 + TANGENTS);
+  for (int r = 0; f->based && r < K; r++) f->room[r] = f->x[r] - f->base[r];
+  times_in_double(K, f->ld, f->W, f->based ? f->room : f->x, f->y);
   for (int r = 0; r < K; r++) f->y[r] += f->q[r];
+}
+
+/* Let q be y without forces. */
+static void unbase(Rub *f) {
+  const int K = f->k * (1 + TANGENTS);
+  if (!f->based) return;
+  times_in_double(K, f->ld, f->W, f->base, f->room);
+  for (int r = 0; r < K; r++) f->q[r] -= f->room[r];
+  f->based = 0;
+}
+
+/* Whether a node would meet without forces. */
+static int meets(const Rub *f, int i) {
+  const int K = f->k * (1 + TANGENTS), r = i * (1 + TANGENTS);
+  return f->q[r] - (f->based ? dot(K, f->W + (size_t)r * f->ld, f->base) : 0) < 0;
 }
 
 /* New sets and directions from x and y; whether a set changed. */
 static int classify(Rub *f) {
-  const int s = 1 + f->m;
+  const int s = 1 + TANGENTS;
   int changed = 0;
   for (int i = 0; i < f->k; i++) {
     const double *x = f->x + i * s, *y = f->y + i * s, w = diagonal(f, i * s + 1);
@@ -25,25 +41,25 @@ static int classify(Rub *f) {
     } else if (!(x[0] > 0)) {
       kind = OPEN;
     } else if (kind == STICK) {
-      for (int a = 0; a < f->m; a++) size += x[1 + a] * x[1 + a];
+      for (int a = 0; a < TANGENTS; a++) size += x[1 + a] * x[1 + a];
       size = sqrt(size);
       if (size > f->mu[i] * x[0]) {
         kind = SLIP;
-        for (int a = 0; a < f->m; a++) e[a] = x[1 + a] / size;
-        e[f->m] = f->mu[i] * x[0] / size;
+        for (int a = 0; a < TANGENTS; a++) e[a] = x[1 + a] / size;
+        e[TANGENTS] = f->mu[i] * x[0] / size;
       }
     } else {
-      for (int a = 0; a < f->m; a++) against += y[1 + a] * e[a];
-      if (f->m > 1) {
+      for (int a = 0; a < TANGENTS; a++) against += y[1 + a] * e[a];
+      if (TANGENTS > 1) {
         double z[2];
-        for (int a = 0; a < f->m; a++) z[a] = x[1 + a] - y[1 + a] / w, size += z[a] * z[a];
+        for (int a = 0; a < TANGENTS; a++) z[a] = x[1 + a] - y[1 + a] / w, size += z[a] * z[a];
         size = sqrt(size);
         if (size > 0)
-          for (int a = 0; a < f->m; a++) e[a] = z[a] / size;
-        e[f->m] = size > 0 ? fmin(1, f->mu[i] * x[0] / size) : 0;
+          for (int a = 0; a < TANGENTS; a++) e[a] = z[a] / size;
+        e[TANGENTS] = size > 0 ? fmin(1, f->mu[i] * x[0] / size) : 0;
       }
       /* without friction a node slips whatever its velocity */
-      if (f->mu[i] > 0 && against > f->tol && (f->m == 1 || size < f->mu[i] * x[0])) kind = STICK;
+      if (f->mu[i] > 0 && against > f->tol && (TANGENTS == 1 || size < f->mu[i] * x[0])) kind = STICK;
     }
     changed |= kind != f->kind[i];
     f->kind[i] = kind;
@@ -53,7 +69,7 @@ static int classify(Rub *f) {
 
 /* y as the sets say, and x with it, where y is unknown; `all`: x from y alone. */
 static void adapt(const Rub *f, int all) {
-  const int s = 1 + f->m, K = f->k * s;
+  const int s = 1 + TANGENTS, K = f->k * s;
   double *u = f->room, *v = u + K;
   int some = all;
   for (int r = 0; r < K; r++) {
@@ -81,14 +97,14 @@ static int choose(const Rub *f) {
 /* Where rounds begin. HERE: as x and sets are; OPENED: nodes that would meet without forces stick; FIRST: besides, from
    forces or slips that continue those of the last two steps, if these had any. `known`: whether y is W x + q. */
 void softgrasp_begin(Rub *f, int where, int known) {
-  const int s = 1 + f->m, K = f->k * s;
+  const int s = 1 + TANGENTS, K = f->k * s;
   const int had = f->had;
   f->begun = 0;
   if (where == FIRST) f->had = 0;
   for (int r = 0; where == FIRST && r < K; r++) f->had |= f->x[r] != 0;
   f->led = where == FIRST && had && f->had;
   for (int i = 0; where != HERE && !f->led && i < f->k; i++)
-    if (f->kind[i] == OPEN && f->q[i * s] < 0) f->kind[i] = STICK;
+    if (f->kind[i] == OPEN && meets(f, i)) f->kind[i] = STICK;
   f->slips = choose(f);
   for (int r = 0; where == FIRST && r < K; r++) {
     const double x = f->x[r], y = f->y[r];
@@ -103,7 +119,7 @@ void softgrasp_begin(Rub *f, int where, int known) {
 
 /* Residual of the equations of the present sets into b; the largest. */
 static double residual(const Rub *f, double *b) {
-  const int s = 1 + f->m;
+  const int s = 1 + TANGENTS;
   double most = 0;
   for (int i = 0; i < f->k; i++) {
     const double *x = f->x + i * s, *y = f->y + i * s, *e = f->e + i * s, w = diagonal(f, i * s + 1);
@@ -120,22 +136,22 @@ static double residual(const Rub *f, double *b) {
 
 /* What a set says of forces, exactly. */
 static void settle(const Rub *f) {
-  const int s = 1 + f->m;
+  const int s = 1 + TANGENTS;
   for (int i = 0; i < f->k; i++) {
     double *x = f->x + i * s;
     for (int a = 0; a < s; a++)
       if (f->kind[i] == OPEN) x[a] = 0;
-      else if (a > 0 && f->kind[i] == SLIP && f->m == 1) x[a] = f->mu[i] * x[0] * f->e[i * s];
+      else if (a > 0 && f->kind[i] == SLIP && TANGENTS == 1) x[a] = f->mu[i] * x[0] * f->e[i * s];
   }
 }
 
 static char side(const Rub *f, int i) {
-  return (char)(f->kind[i] == SLIP && f->e[i * (1 + f->m)] < 0 ? 3 : f->kind[i]);
+  return (char)(f->kind[i] == SLIP && f->e[i * (1 + TANGENTS)] < 0 ? 3 : f->kind[i]);
 }
 
 /* Rows of the matrix of the present sets times u and v. */
 static void rows_times(const Rub *f, const double *u, const double *v, double *to) {
-  const int s = 1 + f->m;
+  const int s = 1 + TANGENTS;
   double of_v[3], of_u[3];
   for (int i = 0; i < f->k; i++, u += s, v += s)
     for (int a = 0; a < width(f, f->slips, f->kind[i]); a++, to++) {
@@ -146,13 +162,13 @@ static void rows_times(const Rub *f, const double *u, const double *v, double *t
 }
 
 static void spread(const Rub *f, const double *c, double *u) {
-  const int s = 1 + f->m;
+  const int s = 1 + TANGENTS;
   for (int i = 0; i < f->k; i++) c += lengthen(f, f->slips, i, f->kind[i], f->e + i * s, c, u + i * s);
 }
 
 /* Changes of u that the present sets say into u; whether there are any. */
 static int say(const Rub *f, double *u) {
-  const int s = 1 + f->m;
+  const int s = 1 + TANGENTS;
   int some = 0;
   for (int i = 0; i < f->k; i++) {
     const double *x = f->x + i * s, *y = f->y + i * s, *e = f->e + i * s;
@@ -172,7 +188,7 @@ static int say(const Rub *f, double *u) {
 
 /* A round: Newton's equations of the present sets. */
 static void begin_round(Rub *f) {
-  const int s = 1 + f->m, K = f->k * s;
+  const int s = 1 + TANGENTS, K = f->k * s;
   double *b = f->room, *u = b + K, *v = u + K, *to = f->lacks;
   const int some = say(f, u);
   residual(f, b);
@@ -192,7 +208,7 @@ static void begin_round(Rub *f) {
   for (int j = 0; j < f->n; j++) f->lacks[j] -= f->solved[j];
   memset(f->solved, 0, K * sizeof(double));
   f->left = sqrt(dot(f->n, f->lacks, f->lacks));
-  f->target = fmax(f->m > 1 ? NEAR * f->left : EXACT * f->left, 0.01 * f->tol);
+  f->target = fmax(TANGENTS > 1 ? NEAR * f->left : EXACT * f->left, 0.01 * f->tol);
   f->taken = 0;
   f->begun = 1;
 }
@@ -200,7 +216,7 @@ static void begin_round(Rub *f) {
 /* Steps of generalized conjugate residuals [EES83] to the end of the round. WANTED: a factor that costs less than more
    steps from this one. */
 static int descend(Rub *f) {
-  const int K = f->k * (1 + f->m), n = f->n, wide = f->single ? 4 : 8;
+  const int K = f->k * (1 + TANGENTS), n = f->n, wide = f->single ? 4 : 8;
   double *u = f->room;
   double step = wide * (0.5 * n * K + (double)n * n) / READ, factor = CALL + 2.0 / 3 * n * n * n / FLOPS * wide / 4;
   if (little(f, n)) step += EACH, factor = 8.0 * n * K / READ + 2.0 / 3 * n * n * n / SLOWER;
@@ -235,7 +251,7 @@ static int descend(Rub *f) {
 }
 
 static void end_round(Rub *f) {
-  const int s = 1 + f->m, K = f->k * s;
+  const int s = 1 + TANGENTS, K = f->k * s;
   double *u = f->room, *v = u + K, *known = v + K;
   say(f, known);
   spread(f, f->solved, u);
@@ -269,8 +285,8 @@ int softgrasp_rub(Rub *f, int begin, int rounds) {
         if (++drifts > DRIFTS) return DRIFTED;
       }
       if (!round || left < f->best / 2) f->best = left, f->since = round;
-      if (!(left < INFINITY) || round >= rounds || (f->m > 1 && round - f->since > PATIENCE)) return CYCLED;
-      for (int p = 0; changed && f->m == 1 && p < round; p++) {
+      if (!(left < INFINITY) || round >= rounds || (TANGENTS > 1 && round - f->since > PATIENCE)) return CYCLED;
+      for (int p = 0; changed && TANGENTS == 1 && p < round; p++) {
         int same = 1;
         for (int i = 0; i < f->k && same; i++) same = f->seen[(size_t)p * f->k + i] == side(f, i);
         if (same) return CYCLED;
@@ -287,7 +303,8 @@ int softgrasp_rub(Rub *f, int begin, int rounds) {
 
 /* Sweeps of projected Gauss-Seidel over the nodes until forces change by less than `still` of the largest; sets. */
 void softgrasp_sweep(Rub *f, int sweeps, double still) {
-  const int s = 1 + f->m, K = f->k * s;
+  const int s = 1 + TANGENTS, K = f->k * s;
+  unbase(f);
   for (int i = 0; i < f->k; i++) {
     double *x = f->x + i * s;
     if (!(x[0] > 0)) memset(x, 0, s * sizeof(double));
@@ -302,7 +319,7 @@ void softgrasp_sweep(Rub *f, int sweeps, double still) {
       memcpy(old, x, s * sizeof(double));
       x[0] = fmax(0, x[0] - (f->q[i * s] + dot(K, f->W + (size_t)i * s * f->ld, f->x)) / diagonal(f, i * s));
       for (int a = 1; a < s; a++) w = fmax(w, diagonal(f, i * s + a));
-      if (f->m > 1) w += fabs(f->W[(size_t)(i * s + 1) * f->ld + i * s + 2]);
+      if (TANGENTS > 1) w += fabs(f->W[(size_t)(i * s + 1) * f->ld + i * s + 2]);
       double slip[2];
       for (int a = 1; a < s; a++) slip[a - 1] = f->q[i * s + a] + dot(K, f->W + (size_t)(i * s + a) * f->ld, f->x);
       for (int a = 1; a < s; a++) size += (x[a] -= slip[a - 1] / w) * x[a];
@@ -321,25 +338,25 @@ void softgrasp_sweep(Rub *f, int sweeps, double still) {
     for (int a = 1; a < s; a++) size += x[a] * x[a];
     size = sqrt(size);
     f->kind[i] = !(x[0] > 0) ? OPEN : size < f->mu[i] * x[0] * (1 - 1e-9) ? STICK : SLIP;
-    for (int a = 0; a < f->m; a++) e[a] = size > 0 ? x[1 + a] / size : a == 0;
-    e[f->m] = 0;
+    for (int a = 0; a < TANGENTS; a++) e[a] = size > 0 ? x[1 + a] / size : a == 0;
+    e[TANGENTS] = 0;
   }
   evaluate(f);
-  if (f->m > 1) classify(f);
+  if (TANGENTS > 1) classify(f);
 }
 
 /* How far x is from the law, as a gap [m]. */
 double softgrasp_wrong(Rub *f) {
-  const int s = 1 + f->m;
+  const int s = 1 + TANGENTS;
   double most = 0;
   evaluate(f);
   for (int i = 0; i < f->k; i++) {
     const double *x = f->x + i * s, *y = f->y + i * s, n = diagonal(f, i * s), w = diagonal(f, i * s + 1);
     double z[2], size = 0, bound = f->mu[i] * fmax(x[0], 0);
     most = fmax(most, fabs(x[0] - fmax(0, x[0] - y[0] / n)) * n);
-    for (int a = 0; a < f->m; a++) z[a] = x[1 + a] - y[1 + a] / w, size += z[a] * z[a];
+    for (int a = 0; a < TANGENTS; a++) z[a] = x[1 + a] - y[1 + a] / w, size += z[a] * z[a];
     size = sqrt(size);
-    for (int a = 0; a < f->m; a++) most = fmax(most, fabs(x[1 + a] - (size > bound ? z[a] * bound / size : z[a])) * w);
+    for (int a = 0; a < TANGENTS; a++) most = fmax(most, fabs(x[1 + a] - (size > bound ? z[a] * bound / size : z[a])) * w);
   }
   return most;
 }

@@ -18,27 +18,26 @@ int softgrasp_stays(const void *flat, const int *rows, int count) {
 
 /* Velocity of a row before the impulse, but along the tangents of a slipping node that of the step. */
 static double before(const Flat *f, const Rub *step, int j) {
-  const int s = 1 + step->m;
+  const int s = 1 + TANGENTS;
   return j % s && step->kind[j / s] == SLIP ? 2 / f->dt * step->y[j] : -f->b[j];
 }
 
-/* The problem of the impulses on these rows, whose N M^-1 N' is A, from p = dt x. */
-void softgrasp_jolt(const void *flat, const Rub *step, const int *rows, const double *A, Rub *jolt) {
+/* The problem of the impulses on these rows from p = dt x, under which velocities are what they were. */
+void softgrasp_jolt(const void *flat, const Rub *step, const int *rows, Rub *jolt) {
   const Flat *f = flat;
-  const int K = jolt->k * (1 + jolt->m);
+  const int K = jolt->k * (1 + TANGENTS);
   for (int r = 0; r < K; r++) {
-    jolt->x[r] = f->dt * f->x[rows[r]];
-    jolt->y[r] = before(f, step, rows[r]);
+    jolt->x[r] = jolt->base[r] = f->dt * f->x[rows[r]];
+    jolt->y[r] = jolt->q[r] = before(f, step, rows[r]);
   }
-  times_in_double(K, K, A, jolt->x, jolt->q);
-  for (int r = 0; r < K; r++) jolt->q[r] = jolt->y[r] - jolt->q[r];
+  jolt->based = 1;
 }
 
 /* The impulses y that were found, the velocities A y that they stop, into b, and the energy that they take; where friction
    would not dissipate energy in the step, y = 0 and false. */
 int softgrasp_jolted(const void *flat, const Rub *step, const int *rows, const Rub *jolt) {
   const Flat *f = flat;
-  const int s = 1 + jolt->m, K = jolt->k * s;
+  const int s = 1 + TANGENTS, K = jolt->k * s;
   double taken[2] = {0, 0};
   memset(f->y, 0, f->k * sizeof(double));
   for (int r = 0; r < K; r++) {

@@ -3,7 +3,7 @@
    Of y = W x + q one side is unknown, u, and the other follows, v: forces x of pressed nodes, or, from W^-1, the slips y of
    slipping nodes and the gaps of open ones. What the sets say of u is known: no force of an open node, no slip of a
    sticking one, no gap of a pressed one, and the force of a slipping node along its direction e is mu times the normal
-   one. The rest has one row of the matrix each. */
+   one. The rest has one row of the matrix each. TANGENTS, the number m of a node, comes from Python, see compiled.py. */
 #pragma once
 #include "dense.h"
 
@@ -36,9 +36,10 @@ enum { LITTLE = 64 };                             /* unknowns up to which factor
 static const double EACH = 4e-6, SLOWER = 5e9;    /* then: seconds of a step beside, operations per second */
 
 typedef struct {
-  int k, m, ld;              /* nodes, tangents, columns of W */
+  int k, ld;                 /* nodes, columns of W */
   const double *W, *mu;
-  double *q;
+  double *q, *base;          /* y without forces; while `based` is 1, y under the forces `base` */
+  int based;
   const double *inverse;     /* of W, (K, K) with K = k (1 + m), or NULL */
   const float *low, *inverse_low; /* both in single precision, where steps use it, or NULL */
   double tol;                /* of gaps and slips */
@@ -46,7 +47,7 @@ typedef struct {
   double *x, *y;             /* forces, and W x + q (K) */
   int had, led;              /* whether that step had forces, and this solve continues them */
   int *kind;                 /* sets (k) */
-  double *e;                 /* of a slipping node: direction of its force, and mu x_n over |x_t - y_t / W_tt| (k (m + 1)) */
+  double *e;                 /* of a slipping node: direction of its force, and mu x_n over |x_t - y_t / W_tt| (k (1 + m)) */
   int slips;                 /* whether the unknowns are y */
   int rows, size;            /* K where there is a factor, else 0; its unknowns */
   int single;                /* whether the factor is in single precision */
@@ -73,15 +74,15 @@ static double diagonal(const Rub *f, int r) { return f->W[(size_t)r * f->ld + r]
 
 /* Unknowns of a node. */
 static int width(const Rub *f, int slips, int kind) {
-  if (kind == SLIP) return f->m;
-  return (kind == OPEN) == slips ? 1 + f->m : 0;
+  if (kind == SLIP) return TANGENTS;
+  return (kind == OPEN) == slips ? 1 + TANGENTS : 0;
 }
 
 /* Row r of a node as coefficients of its v and u. */
 static void row_of(const Rub *f, int slips, int i, int kind, const double *e, int r, double *of_v, double *of_u) {
-  const int first = i * (1 + f->m);
-  const double w = diagonal(f, first + 1), c = f->m > 1 ? e[f->m] : 0;
-  for (int b = 0; b <= f->m; b++) of_v[b] = of_u[b] = 0;
+  const int first = i * (1 + TANGENTS);
+  const double w = diagonal(f, first + 1), c = TANGENTS > 1 ? e[TANGENTS] : 0;
+  for (int b = 0; b <= TANGENTS; b++) of_v[b] = of_u[b] = 0;
   if (kind == OPEN) {
     of_v[r] = diagonal(f, first + r);
   } else if (!slips && (kind == STICK || r == 0)) {
@@ -91,7 +92,7 @@ static void row_of(const Rub *f, int slips, int i, int kind, const double *e, in
     of_u[1] = -w * (1 - c) * e[1], of_u[2] = w * (1 - c) * e[0];
   } else {
     of_v[0] = -w * f->mu[i] * e[r];
-    for (int b = 0; b < f->m; b++) {
+    for (int b = 0; b < TANGENTS; b++) {
       of_u[1 + b] = c * ((r == b) - e[r] * e[b]);
       of_v[1 + b] = w * ((r == b) - of_u[1 + b]);
     }
@@ -100,7 +101,7 @@ static void row_of(const Rub *f, int slips, int i, int kind, const double *e, in
 
 /* Numbers of a node from its u or from its row of the matrix (times the numbers): its unknowns. */
 static int shorten(const Rub *f, int slips, int i, int kind, const double *e, const double *v, double *to) {
-  const int s = 1 + f->m;
+  const int s = 1 + TANGENTS;
   if (kind != SLIP) {
     const int count = width(f, slips, kind);
     for (int b = 0; b < count; b++) to[b] = v[b];
@@ -111,14 +112,14 @@ static int shorten(const Rub *f, int slips, int i, int kind, const double *e, co
   } else {
     to[0] = v[0];
     for (int b = 1; b < s; b++) to[0] += f->mu[i] * e[b - 1] * v[b];
-    if (f->m > 1) to[1] = e[0] * v[2] - e[1] * v[1];
+    if (TANGENTS > 1) to[1] = e[0] * v[2] - e[1] * v[1];
   }
-  return f->m;
+  return TANGENTS;
 }
 
 /* u of a node of its unknowns. */
 static int lengthen(const Rub *f, int slips, int i, int kind, const double *e, const double *c, double *u) {
-  const int s = 1 + f->m, count = width(f, slips, kind);
+  const int s = 1 + TANGENTS, count = width(f, slips, kind);
   for (int b = 0; b < s; b++) u[b] = 0;
   if (kind != SLIP) {
     for (int b = 0; b < count; b++) u[b] = c[b];
@@ -127,14 +128,14 @@ static int lengthen(const Rub *f, int slips, int i, int kind, const double *e, c
   } else {
     u[0] = c[0];
     for (int b = 1; b < s; b++) u[b] = f->mu[i] * c[0] * e[b - 1];
-    if (f->m > 1) u[1] -= c[1] * e[1], u[2] += c[1] * e[0];
+    if (TANGENTS > 1) u[1] -= c[1] * e[1], u[2] += c[1] * e[0];
   }
   return count;
 }
 
 /* v = W u, or W^-1 u; `exact` in double precision. Room for 2 K numbers of type float behind v. */
 static void times(const Rub *f, int exact, const double *u, double *v, float *room) {
-  const int K = f->k * (1 + f->m), ld = f->slips ? K : f->ld;
+  const int K = f->k * (1 + TANGENTS), ld = f->slips ? K : f->ld;
   const float *low = f->slips ? f->inverse_low : f->low;
   if (exact || !low) {
     times_in_double(K, ld, f->slips ? f->inverse : f->W, u, v);
@@ -147,7 +148,7 @@ static void times(const Rub *f, int exact, const double *u, double *v, float *ro
 
 /* Whether the factor is that of the present sets, in 2D. */
 static int fits(const Rub *f) {
-  if (f->m > 1 || f->slips0 != f->slips) return 0;
+  if (TANGENTS > 1 || f->slips0 != f->slips) return 0;
   for (int i = 0; i < f->k; i++)
     if (f->kind[i] != f->kind0[i] || (f->kind[i] == SLIP && f->e[2 * i] != f->e0[2 * i])) return 0;
   return 1;
@@ -180,7 +181,7 @@ static void eliminate(int n, double *LU, int *pivot) {
 
 /* The matrix of the present sets by rows, into LU; whether it is factored there. */
 int softgrasp_matrix(Rub *f) {
-  const int s = 1 + f->m, K = f->k * s, ld = f->slips ? K : f->ld;
+  const int s = 1 + TANGENTS, K = f->k * s, ld = f->slips ? K : f->ld;
   const double *M = f->slips ? f->inverse : f->W;
   double *v = f->room, *row = v + K, of_v[3], of_u[3];
   memcpy(f->kind0, f->kind, f->k * sizeof(int));
@@ -194,7 +195,7 @@ int softgrasp_matrix(Rub *f) {
     for (int a = 0; a < width(f, f->slips, f->kind[i]); a++, r++) {
       const double *rows = M + (size_t)i * s * ld;
       row_of(f, f->slips, i, f->kind[i], f->e + i * s, a, of_v, of_u);
-      if (f->m > 1)
+      if (TANGENTS > 1)
         for (int j = 0; j < K; j++) v[j] = of_v[0] * rows[j] + of_v[1] * rows[ld + j] + of_v[2] * rows[2 * (size_t)ld + j];
       else
         for (int j = 0; j < K; j++) v[j] = of_v[0] * rows[j] + of_v[1] * rows[ld + j];
@@ -210,7 +211,7 @@ int softgrasp_matrix(Rub *f) {
 
 /* z: unknowns that the rows g ask for if the sets were those of the factor; those of other sets from their own node. */
 static void precondition(const Rub *f, const double *g, double *z) {
-  const int s = 1 + f->m, K = f->k * s, slips = f->slips;
+  const int s = 1 + TANGENTS, K = f->k * s, slips = f->slips;
   double *c = f->room + 6 * K, full[3], own[2][2], of_v[3], of_u[3];
   float *low = (float *)(c + K);
   const double *from = g;
@@ -219,7 +220,7 @@ static void precondition(const Rub *f, const double *g, double *z) {
     const double *e = f->e + i * s;
     const int kind = f->kind[i], count = width(f, slips, kind);
     full[0] = full[1] = full[2] = 0;
-    if (kind != SLIP || f->m == 1)
+    if (kind != SLIP || TANGENTS == 1)
       for (int b = 0; b < count; b++) full[kind == SLIP && slips ? 1 + b : b] = from[b];
     else if (slips)
       full[1] = from[0], full[2] = from[1];
@@ -229,7 +230,7 @@ static void precondition(const Rub *f, const double *g, double *z) {
     if (f->kind0[i] == SLIP && !slips) {
       const double *e0 = f->e0 + i * s;
       c[r++] = full[0];
-      if (f->m > 1) c[r++] = e0[0] * full[2] - e0[1] * full[1];
+      if (TANGENTS > 1) c[r++] = e0[0] * full[2] - e0[1] * full[1];
     } else {
       const int skip = f->kind0[i] == SLIP;
       for (int b = 0; b < width(f, slips, f->kind0[i]); b++) c[r++] = full[skip + b];
@@ -248,7 +249,7 @@ static void precondition(const Rub *f, const double *g, double *z) {
     c += had;
     if (had && kind == SLIP && !slips) {
       z[0] = full[0];
-      if (f->m > 1) z[1] = e[0] * full[2] - e[1] * full[1];
+      if (TANGENTS > 1) z[1] = e[0] * full[2] - e[1] * full[1];
     } else if (had) {
       for (int b = 0; b < count; b++) z[b] = full[b + (kind == SLIP)];
     } else if (!slips || kind == OPEN) {
@@ -257,16 +258,16 @@ static void precondition(const Rub *f, const double *g, double *z) {
         z[b] = g[b] / (slips ? diagonal(f, a) * f->inverse[(size_t)a * K + a] : diagonal(f, a));
       }
     } else {
-      for (int a = 0; a < f->m; a++) {
+      for (int a = 0; a < TANGENTS; a++) {
         row_of(f, slips, i, kind, e, a, of_v, of_u);
-        for (int b = 0; b < f->m; b++) {
+        for (int b = 0; b < TANGENTS; b++) {
           own[a][b] = of_u[1 + b];
           for (int d = 0; d < s; d++) own[a][b] += of_v[d] * f->inverse[(size_t)(i * s + d) * K + i * s + 1 + b];
         }
       }
-      const double det = f->m > 1 ? own[0][0] * own[1][1] - own[0][1] * own[1][0] : own[0][0];
-      z[0] = f->m > 1 ? (own[1][1] * g[0] - own[0][1] * g[1]) / det : g[0] / det;
-      if (f->m > 1) z[1] = (own[0][0] * g[1] - own[1][0] * g[0]) / det;
+      const double det = TANGENTS > 1 ? own[0][0] * own[1][1] - own[0][1] * own[1][0] : own[0][0];
+      z[0] = TANGENTS > 1 ? (own[1][1] * g[0] - own[0][1] * g[1]) / det : g[0] / det;
+      if (TANGENTS > 1) z[1] = (own[0][0] * g[1] - own[1][0] * g[0]) / det;
     }
     g += count;
     z += count;

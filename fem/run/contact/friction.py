@@ -216,17 +216,17 @@ class Side:
         A: N M^-1 N' of these rows, (k d, k d).
         mu: coefficients of friction of their nodes, (k,).
         forces, sets: where C finds the forces of ``coulomb`` and its sets.
-        rows, block: where it finds ``stopped`` and ``A``.
+        rows: where it finds ``stopped``.
     """
 
     def __init__(self, tangents: int, inverse: Inverse) -> None:
         self.coulomb, self.jolt = Coulomb(tangents, inverse=inverse), Coulomb(tangents)
         self.stopped, self.A, self.mu, self.x = np.zeros(0, np.intc), np.zeros((0, 0)), np.zeros(0), np.zeros(0)
-        self.ffi, self.c = friction_library()
+        self.ffi, self.c = friction_library(tangents)
         self._point()
 
     def _point(self) -> None:
-        self.rows, self.block = self.ffi.from_buffer("int[]", self.stopped), self.ffi.from_buffer("double[]", self.A)
+        self.rows = self.ffi.from_buffer("int[]", self.stopped)
 
     def stop(self, rows: Ints, A: Array, mu: Array, other: Side) -> None:
         """Room for impulses on other rows, of all N M^-1 N'; while they stay, their problem keeps its factor.
@@ -306,7 +306,7 @@ class FlatFriction(FlatContact):
         step, jolt = side.coulomb.f, side.jolt
         if not side.c.softgrasp_stays(f, side.rows, len(side.stopped)):
             self._stop_others(side)
-        side.c.softgrasp_jolt(f, step, side.rows, side.block, jolt.f)
+        side.c.softgrasp_jolt(f, step, side.rows, jolt.f)
         jolt.solve(len(side.mu), side.A, jolt.q, side.mu, f.still, known=True)
         if not side.c.softgrasp_jolted(f, step, side.rows, jolt.f):
             on = side.stopped[:: self.d]
