@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg.lapack import dpocon, dpotrf, dpotri
 
 Array = NDArray[Any]
 WORTH = 1.0  # unknowns of factors cubed, over those of W, from which on its inverse is worth its time
+WELL = 1e-2  # inverse of the condition of W from which on W^-1 needs no check: its error is rounding
 NONE = np.zeros((0, 0))
 
 
@@ -21,6 +22,7 @@ class Inverse:
         k: number of rows in use.
         spent: unknowns of the factors so far, cubed; -1 where W has no inverse.
         made: W^-1, (k, k); empty before.
+        sure: whether it is exact but for rounding.
     """
 
     def __init__(self) -> None:
@@ -29,7 +31,7 @@ class Inverse:
 
     def forget(self) -> None:
         """Drop all, as W is another one now."""
-        self.spent, self.made, self.low, self.made_low = 0.0, NONE, NONE, NONE
+        self.spent, self.made, self.low, self.made_low, self.sure = 0.0, NONE, NONE, NONE, False
 
     def of(self, W: Array, k: int) -> None:
         """Be that of the first k rows of W."""
@@ -43,7 +45,9 @@ class Inverse:
         """Make W^-1; not where W is singular."""
         if len(self.made):
             return
-        factor, info = dpotrf(self.W[: self.k, : self.k], lower=1, clean=0)
+        W = self.W[: self.k, : self.k]
+        factor, info = dpotrf(W, lower=1, clean=0)
+        self.sure = info == 0 and dpocon(factor, np.abs(W).sum(axis=0).max(), uplo="L")[0] > WELL
         inverse, more = dpotri(factor, lower=1, overwrite_c=1) if info == 0 else (factor, info)
         if more:
             self.refuse()

@@ -4,6 +4,7 @@
 #include "jolt.h"
 
 static const double NEAR = 0.2, EXACT = 1e-14; /* by how much a round reduces its residual, in 3D and in 2D */
+static const double SURELY = 1e-4; /* of tol: what settling may change unseen */
 
 /* y = W x + q, or W (x - base) + q. */
 static void evaluate(const Rub *f) {
@@ -186,12 +187,11 @@ static int say(const Rub *f, double *u) {
   return some;
 }
 
-/* A round: Newton's equations of the present sets. */
+/* A round: Newton's equations of the present sets, whose residual is in the room. */
 static void begin_round(Rub *f) {
   const int s = 1 + TANGENTS, K = f->k * s;
   double *b = f->room, *u = b + K, *v = u + K, *to = f->lacks;
   const int some = say(f, u);
-  residual(f, b);
   if (some) times(f, 0, u, v, (float *)(v + K));
   else memset(v, 0, K * sizeof(double));
   memcpy(f->follows, v, K * sizeof(double));
@@ -273,15 +273,17 @@ int softgrasp_rub(Rub *f, int begin, int rounds) {
   double *b = f->room;
   for (int round = begin, drifts = 0;; round++) {
     if (!f->begun) {
-      double left = residual(f, b);
+      double left = round || f->led ? 0 : residual(f, b);
       int changed = 0;
-      if (round || f->led || left <= f->tol) changed = classify(f), left = residual(f, b);
+      if (left <= f->tol) changed = classify(f), left = residual(f, b);
       if (!changed && left <= f->tol) {
         if (!f->slips) return SOLVED;
         settle(f);
+        if (f->sure && left <= SURELY * f->tol) return SOLVED;
         evaluate(f);
         changed = classify(f);
-        if (!changed && residual(f, b) <= f->tol) return SOLVED;
+        left = residual(f, b);
+        if (!changed && left <= f->tol) return SOLVED;
         if (++drifts > DRIFTS) return DRIFTED;
       }
       if (!round || left < f->best / 2) f->best = left, f->since = round;

@@ -41,6 +41,7 @@ typedef struct {
   double *q, *base;          /* y without forces; while `based` is 1, y under the forces `base` */
   int based;
   const double *inverse;     /* of W, (K, K) with K = k (1 + m), or NULL */
+  int sure;                  /* whether it is exact but for rounding */
   const float *low, *inverse_low; /* both in single precision, where steps use it, or NULL */
   double tol;                /* of gaps and slips */
   double *before, *before_y; /* x and y at the end of the step before the last (K) */
@@ -190,19 +191,25 @@ int softgrasp_matrix(Rub *f) {
   f->rows = K;
   f->size = f->age = 0;
   f->work = 0;
-  for (int i = 0; i < f->k; i++) f->size += width(f, f->slips, f->kind[i]);
-  for (int i = 0, r = 0; i < f->k; i++)
-    for (int a = 0; a < width(f, f->slips, f->kind[i]); a++, r++) {
+  int *on = f->pivot, count = 0; /* nodes with unknowns */
+  for (int i = 0; i < f->k; i++) {
+    const int own = width(f, f->slips, f->kind[i]);
+    if (own) on[count++] = i;
+    f->size += own;
+  }
+  for (int g = 0, r = 0; g < count; g++)
+    for (int a = 0, i = on[g]; a < width(f, f->slips, f->kind[i]); a++, r++) {
       const double *rows = M + (size_t)i * s * ld;
       row_of(f, f->slips, i, f->kind[i], f->e + i * s, a, of_v, of_u);
-      if (TANGENTS > 1)
-        for (int j = 0; j < K; j++) v[j] = of_v[0] * rows[j] + of_v[1] * rows[ld + j] + of_v[2] * rows[2 * (size_t)ld + j];
-      else
-        for (int j = 0; j < K; j++) v[j] = of_v[0] * rows[j] + of_v[1] * rows[ld + j];
+      for (int h = 0; h < count; h++)
+        for (int j = on[h] * s; j < (on[h] + 1) * s; j++) {
+          v[j] = 0;
+          for (int b = 0; b < s; b++) v[j] += of_v[b] * rows[b * (size_t)ld + j];
+        }
       for (int b = 0; b < s; b++) v[i * s + b] += of_u[b];
       if (!f->slips && (a == 0 || f->kind[i] == STICK)) v[i * s + a] *= 1 + (f->single ? RIDGE_SINGLE : RIDGE);
       double *to = f->single ? row : f->LU + (size_t)r * f->size;
-      for (int j = 0; j < f->k; j++) to += shorten(f, f->slips, j, f->kind[j], f->e + j * s, v + j * s, to);
+      for (int h = 0; h < count; h++) to += shorten(f, f->slips, on[h], f->kind[on[h]], f->e + on[h] * s, v + on[h] * s, to);
       for (int j = 0; f->single && j < f->size; j++) f->LU_single[(size_t)r * f->size + j] = (float)row[j];
     }
   if (little(f, f->size)) eliminate(f->size, f->LU, f->pivot);
