@@ -191,25 +191,28 @@ int softgrasp_matrix(Rub *f) {
   f->rows = K;
   f->size = f->age = 0;
   f->work = 0;
-  int *on = f->pivot, count = 0; /* nodes with unknowns */
+  int *run = f->pivot, count = 0, in = 0; /* first nodes of runs with unknowns, and nodes behind them */
   for (int i = 0; i < f->k; i++) {
     const int own = width(f, f->slips, f->kind[i]);
-    if (own) on[count++] = i;
+    if (in != (own > 0)) run[count++] = i;
+    in = own > 0;
     f->size += own;
   }
-  for (int g = 0, r = 0; g < count; g++)
-    for (int a = 0, i = on[g]; a < width(f, f->slips, f->kind[i]); a++, r++) {
+  if (in) run[count++] = f->k;
+  for (int i = 0, r = 0; i < f->k; i++)
+    for (int a = 0; a < width(f, f->slips, f->kind[i]); a++, r++) {
       const double *rows = M + (size_t)i * s * ld;
       row_of(f, f->slips, i, f->kind[i], f->e + i * s, a, of_v, of_u);
-      for (int h = 0; h < count; h++)
-        for (int j = on[h] * s; j < (on[h] + 1) * s; j++) {
-          v[j] = 0;
-          for (int b = 0; b < s; b++) v[j] += of_v[b] * rows[b * (size_t)ld + j];
+      for (int g = 0; g < count; g += 2)
+        for (int j = run[g] * s; j < run[g + 1] * s; j++) {
+          v[j] = of_v[0] * rows[j] + of_v[1] * rows[ld + j];
+          if (TANGENTS > 1) v[j] += of_v[2] * rows[2 * (size_t)ld + j];
         }
       for (int b = 0; b < s; b++) v[i * s + b] += of_u[b];
       if (!f->slips && (a == 0 || f->kind[i] == STICK)) v[i * s + a] *= 1 + (f->single ? RIDGE_SINGLE : RIDGE);
       double *to = f->single ? row : f->LU + (size_t)r * f->size;
-      for (int h = 0; h < count; h++) to += shorten(f, f->slips, on[h], f->kind[on[h]], f->e + on[h] * s, v + on[h] * s, to);
+      for (int g = 0; g < count; g += 2)
+        for (int j = run[g]; j < run[g + 1]; j++) to += shorten(f, f->slips, j, f->kind[j], f->e + j * s, v + j * s, to);
       for (int j = 0; f->single && j < f->size; j++) f->LU_single[(size_t)r * f->size + j] = (float)row[j];
     }
   if (little(f, f->size)) eliminate(f->size, f->LU, f->pivot);
