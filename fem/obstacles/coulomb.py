@@ -84,8 +84,8 @@ class Coulomb(Rounds):
         self._use(self.m > 1 and k >= SINGLE)
         self._point(
             before=self.before, before_y=self.before_y, x=x, y=y, kind=kind, e=e, pivot=self.pivot, kind0=self.kind0,
-            q=self.q, base=np.zeros(K), mu=self.mu, e0=self.e0, solved=np.zeros(K), lacks=np.zeros(K), Z=np.zeros((KEPT, K)),
-            C=np.zeros((KEPT, K)), V=np.zeros((KEPT, K)), follows=np.zeros(K), room=np.zeros(8 * K),
+            q=self.q, mu=self.mu, e0=self.e0, solved=np.zeros(K), lacks=np.zeros(K), follows=np.zeros(K),
+            base=np.zeros(K), Z=np.zeros((KEPT, K)), C=np.zeros((KEPT, K)), V=np.zeros((KEPT, K)), room=np.zeros(8 * K),
             seen=np.zeros((ROUNDS[self.m], k), np.int8), tally=self.tally,
         )  # fmt: skip
         self.f.k, self.f.rows, self.f.slips, self.f.had, self.f.based = k, 0, 0, 0, 0
@@ -117,7 +117,7 @@ class Coulomb(Rounds):
         Args:
             W: symmetric, positive definite, rows of a node side by side; contiguous, may have room for more. Its
                 factor is kept while the same array comes again: call `forget` where its entries have changed.
-            q: half the gap and half the slip without forces, (k (1 + tangents),) [m].
+            q: half the gap and half the slip without forces, (k (1 + tangents),) [m]; or the attribute q that C has filled.
             mu: coefficients of friction, (k,).
             tol: by how much gaps may be negative, and slips of the wrong sign [m].
             first: whether a step begins here: from forces that continue those of the last two steps.
