@@ -117,7 +117,7 @@ class Coulomb(Rounds):
         Args:
             W: symmetric, positive definite, rows of a node side by side; contiguous, may have room for more. Its
                 factor is kept while the same array comes again: call `forget` where its entries have changed.
-            q: half the gap and half the slip without forces, (k (1 + tangents),) [m]; or ``self.q``, which C has filled.
+            q: half the gap and half the slip without forces, (k (1 + tangents),) [m]; or ``self.q`` that C has filled.
             mu: coefficients of friction, (k,).
             tol: by how much gaps may be negative, and slips of the wrong sign [m].
             first: whether a step begins here: from forces that continue those of the last two steps.
