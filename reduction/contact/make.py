@@ -1,7 +1,7 @@
 """Making of reduced models with contact: V = [K^-1 G, modes, K^-1 N', S^-1 N'm], orthonormal in the mass [CB68].
 
-On fine meshes rows of hat functions h_j over several nodes replace those of nodes: mean gaps are >= 0. The last column,
-S = K + s D + s^2 M at a frequency above the modes, is the answer to the impulse m that stops a face that lands at once.
+On fine meshes rows of hat functions h_j over several nodes replace those of nodes: mean gaps are >= 0. The last columns,
+S = K + s D + s^2 M at frequencies above the modes, are answers to the impulse m that stops a face that lands at once.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
 PREFIX = "softgrasp_landing_"
 DEPENDENT = 1e-13  # least share of a direction of the basis in its Gram matrix, scaled [1]
-LANDING = 8.0  # s of the answer to a landing over the frequency of the highest mode; 2 to 32 do as well [1]
+# s of the answers to a landing over the frequency of the highest mode, chosen on motions that are not held out [1].
+LANDING = 8.0, 250.0
+EACH = 6  # modes per such answer, of which the second helps the force and the mode in its place the deformation
 # Power of the distance from the end by which hat functions crowd there, where pressures are steep; chosen on the
 # motions whose errors docs/guide gives [1].
 CROWD = 1.6
@@ -42,8 +44,8 @@ def contact_model(model: Model, modes: int = 10, reach: float | None = None, row
 
     Args:
         model: with ``effects.obstacles`` and a hand that does not feel the tissue.
-        modes: number of columns beside the responses to the hand and to the rows, at least 2: clamped modes, and one
-            answer to a landing for each direction of the half-spaces.
+        modes: number of columns beside the responses to the hand and to the rows, at least 2: clamped modes, and for each
+            direction of the half-spaces an answer to a landing, two from 12 columns per direction on.
         reach: rows N are kept for boundary nodes that come nearer than this to an obstacle while the undeformed body
             follows the hand of the scene [m]; None: half the distance of boundary nodes. A run in which another node
             enters an obstacle is refused.
@@ -76,9 +78,11 @@ def contact_model(model: Model, modes: int = 10, reach: float | None = None, row
     hats = tuple(_hats(surface, kept, o, rows) for o in obstacles)
     loads = _responses(model, surface, kept, obstacles, hats)
     normals = np.unique([plane(o)[0] for o in obstacles], axis=0)
-    squares, shapes = lowest_modes(system, max(1, modes - len(normals)))
+    answers = LANDING[: max(1, modes // (EACH * len(normals)))]
+    squares, shapes = lowest_modes(system, max(1, modes - len(answers) * len(normals)))
     blocks = [static_columns(system, np.asfortranarray(np.hstack([system.G, loads]))), shapes]
-    blocks.append(_landing(system, surface, kept, normals, LANDING * float(np.sqrt(squares[-1]))))
+    highest = float(np.sqrt(squares[-1]))
+    blocks += [_landing(system, surface, kept, normals, ratio * highest) for ratio in answers]
     V, stiffness = _diagonal(model, np.hstack(blocks))
     seconds["basis"] = time.perf_counter() - begin
     begin = time.perf_counter()

@@ -20,8 +20,8 @@ from softgrasp.study.shell import median_processor_seconds
 
 MODES = (20, 14, 5)  # clamped modes beside the responses unless the scene names N
 HATS = 14  # rows of hat functions along a half-space then
-LEAST = 4  # modes for which a given N must have room beside rows of all nodes
-SHARE = 0.5  # of a given N without the hand's columns that rows of hat functions take
+LEAST = 4  # modes for which a given N must have room beside rows of all nodes, where there are no hat functions
+SHARE = 0.5  # of a given N without the hand's columns that rows take: hat functions, where those of nodes take more
 RUNS = 9  # behind each median of the time of a run
 DEEP, DEEPER = 1.05, 1.15  # ways of held-out motions towards the first obstacle, over that of the scene
 ASIDE = 0.5  # way along it over that towards it, where the motion of the scene has none
@@ -169,10 +169,11 @@ def _choices(model: Model, refused: dict[str, str]) -> Iterator[tuple[int | None
     for N in sorted(set(options.N), reverse=True):
         free = N - layout.n_s
         rows = round(SHARE * free / directions)
-        if free >= directions * nodes + LEAST:
+        hats = layout.dimension == 2 and rows >= 2
+        if free >= directions * nodes + LEAST and not (hats and rows < nodes):
             some = True
             yield None, free - directions * nodes
-        elif layout.dimension == 2 and rows >= 2:
+        elif hats:
             some = True
             yield rows, free - directions * rows
         else:

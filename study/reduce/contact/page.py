@@ -16,7 +16,7 @@ CAPTIONS = {
     "accurate reduced one.",
 }
 NOTE = (
-    "The basis has the response to the hand, clamped modes, an answer to a landing, and the response to every row: a "
+    "The basis has the response to the hand, clamped modes, answers to a landing, and the response to every row: a "
     "boundary node that may touch, or a hat function over several. The motion of the scene decides which nodes have "
     "rows, and nothing else. z: relative error of the deformation over all nodes and steps; force: of the forces of "
     "all obstacles over all steps. Held out: largest on motions that trained no model. depth: of a node in an "
