@@ -106,11 +106,11 @@ def length_unit(largest: float) -> tuple[float, str]:
     return (1e3, "mm") if largest >= 1e-4 else (1e6, "µm")
 
 
-def percent(share: float, sign: str = "") -> str:
-    """A share as a percentage of two digits, "+" with its sign; "> 9999 %" also where it is not finite."""
+def percent(share: float, sign: str = "", digits: int = 2) -> str:
+    """A share as a percentage of so many digits, "+" with its sign; "> 9999 %" also where it is not finite."""
     if not abs(share) < 100:
         return "< -9999 %" if share < 0 else "> 9999 %"
-    return f"{100 * share:{sign}{'.2g' if abs(share) < 0.995 else '.0f'}} %"
+    return f"{100 * share:{sign}{f'.{digits}g' if abs(share) < 0.995 else '.0f'}} %"
 
 
 def unbroken(text: str) -> str:

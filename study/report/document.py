@@ -27,6 +27,14 @@ SHOWN, MOST_ROWS = 8, 14  # rows of a longer table that stand unfolded
 class Share(float):
     """A number that page and terminal show as a percentage, and a CSV file in full."""
 
+    digits = 2
+
+
+class FineShare(Share):
+    """One of three digits, for numbers near a bound."""
+
+    digits = 3
+
 
 @dataclass(frozen=True)
 class Section:
@@ -138,7 +146,7 @@ def cell_text(cell: Any) -> str:
     if isinstance(cell, bool | np.bool_):
         return "yes" if cell else "no"
     if isinstance(cell, Share):
-        return percent(cell)
+        return percent(cell, digits=cell.digits)
     return digits(float(cell)) if isinstance(cell, float | np.floating) else str(cell)
 
 
@@ -169,7 +177,7 @@ def entry(row: Any, path: str) -> Any:
 def table_of(rows: Sequence[Any], columns: Columns, title: str = "") -> Table:
     """One line a row: for each heading a function of the row, or the entry at a path, formatted ``drift .0e``.
 
-    The format 3 is that of :func:`number`, % a :class:`Share`; without one the entry stands as it is.
+    The format 3 is that of :func:`number`, % a :class:`Share`, %3 a finer one; without one the entry stands as it is.
     """
 
     def cell(row: Any, column: str | Callable[[Any], Any]) -> Any:
@@ -179,8 +187,8 @@ def table_of(rows: Sequence[Any], columns: Columns, title: str = "") -> Table:
         value = entry(row, path)
         if not form or value is None:
             return value if not form else number(None)
-        if form == "%":
-            return Share(value)
+        if form in ("%", "%3"):
+            return Share(value) if form == "%" else FineShare(value)
         return number(value) if form == "3" else f"{value:{form}}"
 
     return Table(tuple(columns), [[cell(row, column) for column in columns.values()] for row in rows], title)

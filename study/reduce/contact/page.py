@@ -23,8 +23,8 @@ NOTE = (
     "obstacle, which hat functions allow between them."
 )
 ERRORS: Columns = {
-    "rows": "p.rows", "count": "p.count", "N": "p.N", "z": "p.error %", "force": "p.error_force %",
-    "z held out": "p.error_held_out %", "force held out": "p.error_force_held_out %", "depth [m]": "p.depth .2g",
+    "rows": "p.rows", "count": "p.count", "N": "p.N", "z": "p.error %3", "force": "p.error_force %3",
+    "z held out": "p.error_held_out %3", "force held out": "p.error_force_held_out %3", "depth [m]": "p.depth .2g",
 }  # fmt: skip
 TIMES: Columns = {
     "rows": "p.rows", "N": "p.N", "run [ms]": lambda r: f"{1e3 * r['p'].time_online:.2f}",
@@ -64,10 +64,10 @@ def compose(study: ContactStudy, drawn: Sequence[Path], models: Sequence[Path]) 
 def accuracy(study: ContactStudy) -> str:
     """Errors of the most accurate model."""
     p = study.points[study.best]
-    own = f"{percent(p.error)} in the deformation" + _and(p.error_force)
+    own = f"{percent(p.error, digits=3)} in the deformation" + _and(p.error_force)
     if p.error_held_out is None:
         return f"The most accurate reduced model, N = {p.N}, has an error of {own}; it was tested on no other motion."
-    held = f"{percent(p.error_held_out)} in the deformation" + _and(p.error_force_held_out)
+    held = f"{percent(p.error_held_out, digits=3)} in the deformation" + _and(p.error_force_held_out)
     return (
         f"The most accurate reduced model, N = {p.N}, has an error of {own}; on {len(study.motions)} held-out motions "
         f"at most {held}."
@@ -85,7 +85,7 @@ def headline(study: ContactStudy) -> str:
 
 
 def _and(force: float | None) -> str:
-    return "" if force is None else f" and {percent(force)} in the forces"
+    return "" if force is None else f" and {percent(force, digits=3)} in the forces"
 
 
 def _motions(study: ContactStudy) -> Table:
@@ -95,7 +95,7 @@ def _motions(study: ContactStudy) -> Table:
         z, force = motion.errors.get(study.best, (None, None))
         rows.append((
             motion.title, ", ".join(f"{x:.3g}" for x in motion.target), percent(motion.touching), motion.force,
-            None if z is None else percent(z), None if force is None else percent(force),
+            None if z is None else percent(z, digits=3), None if force is None else percent(force, digits=3),
         ))  # fmt: skip
     header = ("motion", "target [m]", "steps with contact", "largest force [N]", "z", "force")
     return Table(header, rows, f"Held-out motions, errors of {study.best}")

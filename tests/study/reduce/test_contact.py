@@ -51,12 +51,25 @@ def test_numbers_are_those_of_the_saved_models(tmp_path: Path) -> None:
     assert result["best"] == best["model"] == "nodes_18"
     assert best["error"] < 1e-3  # measured 7e-5
     assert best["error_held_out"] < 1e-3
-    assert best["error_force_held_out"] < 2e-2  # measured 5e-3
+    assert best["error_force_held_out"] < 1e-2  # measured 5e-3
     assert len(result["held_out"]) == 3
     assert all(motion["touching"] > 0.1 for motion in result["held_out"])
     page = (out / "report.html").read_text()
     assert "No certificate covers contact" in page
     assert (out / "force.png").stat().st_size > 1000
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("cells", ["[24, 16]", "[36, 24]"])
+def test_thirty_columns_are_enough_for_motions_that_made_no_model(cells: str) -> None:
+    model = sg.build("set_down", [f"tissue.cells={cells}", "reduction.N=[30]"], comm=MPI.COMM_SELF)
+    study = measure_contact(*measured_run(model, lambda *_: None), lambda *_: None)
+    point = study.points["hats_30"]  # nodes alone would take 27 and 39 columns
+    assert point.N == 30
+    assert point.error_held_out is not None
+    assert point.error_force_held_out is not None
+    assert point.error_held_out < 1e-3  # asked for; measured 7.1e-5 and 3.5e-5
+    assert point.error_force_held_out < 1e-2  # asked for; measured 7.5e-3 and 8.9e-3, 1.02e-2 with one answer
 
 
 @pytest.mark.ranks(3)
