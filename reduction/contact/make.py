@@ -1,7 +1,7 @@
 """Making of reduced models with contact: V = [K^-1 G, modes, K^-1 N', S^-1 N'm], orthonormal in the mass [CB68].
 
-On fine meshes rows of hat functions h_j over several nodes replace those of nodes: mean gaps are >= 0. The last columns,
-S = K + s D + s^2 M at frequencies above the modes, are answers to the impulse m that stops a face that lands at once.
+On fine meshes rows of hat functions h_j over several nodes replace those of nodes: mean gaps are >= 0. The last
+columns, S = K + s D + s^2 M at frequencies above the modes, answer the impulse m that stops a face landing at once.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def contact_model(model: Model, modes: int = 10, reach: float | None = None, row
 
     Args:
         model: with ``effects.obstacles`` and a hand that does not feel the tissue.
-        modes: number of columns beside the responses to the hand and to the rows, at least 2: clamped modes, and for each
-            direction of the half-spaces an answer to a landing, two from 12 columns per direction on.
+        modes: number of columns beside the responses to the hand and to the rows, at least 2: clamped modes, and for
+            each direction of the half-spaces an answer to a landing, two from 12 columns per direction on.
         reach: rows N are kept for boundary nodes that come nearer than this to an obstacle while the undeformed body
             follows the hand of the scene [m]; None: half the distance of boundary nodes. A run in which another node
             enters an obstacle is refused.
