@@ -180,6 +180,7 @@ def contact_keys(contact: ContactRecord) -> dict[str, Any]:
     """What obstacles did, for result.json: forces [N], gaps [m], energies [J]."""
     return {
         "penetration": contact.penetration,
+        "chatter": contact.chatter,
         "work": contact.work,
         "taken_by_touch": contact.touch,
         "taken_by_impulses": contact.stopped,
@@ -231,7 +232,8 @@ def contact_rows(contact: ContactRecord) -> list[tuple[str, str]]:
         rows.append(("all obstacles", f"force ({force}) N at the end"))
     taken = f"{contact.touch:.3g} J at first touch, {contact.stopped:.3g} J by impulses"
     taken += f", {contact.rubbed:.3g} J by friction" if contact.rubbed else ""
-    return [*rows, ("dissipated by contact", f"{taken}; deepest penetration {contact.penetration:.1e} m")]
+    taken += f"; deepest penetration {contact.penetration:.1e} m, chatter {contact.chatter}"
+    return [*rows, ("dissipated by contact", taken)]
 
 
 def newton_keys(newton: NewtonFigures) -> dict[str, float]:

@@ -48,6 +48,16 @@ class ContactRecord(Shown):
         return max(0.0, -float(self.gap.min(initial=0.0)))
 
     @property
+    def chatter(self) -> int:
+        """Changes of the numbers of touching nodes that the next step takes back, in the whole run.
+
+        Nodes that leave count against others that begin to touch in the same step.
+        """
+        change = np.diff(self.touching, axis=0, prepend=0.0)
+        back = np.minimum(np.abs(change[1:]), np.abs(change[:-1]))
+        return int(back[change[1:] * change[:-1] < 0].sum())
+
+    @property
     def force_end(self) -> Array:
         """Force of each obstacle on the tissue at the end, mean of the last two steps, (obstacles, d) [N].
 
