@@ -67,7 +67,7 @@ class FiniteContact(Contact):
         midpoint, tol = self.midpoint, max(self.tolerance(free), CLOSE * self.layout.extent)
         known, before = self.after < 0, self._make_rows(np.zeros((0, 2), dtype=int))
         known[self.rows.obstacle, self.rows.node] = True
-        active = known & False
+        active, self.planes.kept = known & False, known & False
         active[self.rows.obstacle, self.rows.node] = True
         x1, pressing = free, np.zeros_like(midpoint.r_array)
         for count in range(MOST):
@@ -90,10 +90,12 @@ class FiniteContact(Contact):
             x1 = x0 + self._way(n)
             self.after = self._gaps(x1, n + 1)
             new = (self.after < -tol) & ~known
-            reached = np.abs(self.after[at])[pressed].max(initial=0.0)
+            left = self.planes.left(rows, n, x0, x1, self.gaps, self.after)
+            reached = np.abs(left)[pressed].max(initial=0.0)
             if self.after.min() >= -tol and reached <= tol:
                 return f, rows.take(pressed)
             known |= new
+            self.planes.keep(rows, np.where(pressed, np.abs(left), -left) > tol, count)
         raise unsettled(max(float(reached), -float(self.after.min())))
 
     def _strengths(self, rows: Rows, m: int) -> Array:

@@ -11,7 +11,7 @@ v and s N'y to r. The work of x is x'(g_{n+1} - g_n - dg) = -x'(g_n + dg), the i
 neither ever adds any at obstacles and a hand at rest.
 
 Where normals turn, the mean normal n of a step has n.(x_1 - x_0) = g_1 - g_0, so that the same holds; it is found by
-rounds on the small problem alone. A two-way hand feels N_s'x, N_s = N T.
+rounds on the small problem alone, see `planes`. A two-way hand feels N_s'x, N_s = N T.
 """
 
 from __future__ import annotations
@@ -26,11 +26,12 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.surface import Surface, make_surface
 from softgrasp.fem.obstacles import HalfSpace, make_obstacles
-from softgrasp.fem.obstacles.obstacle import Obstacle, check_passage, mean_normal
+from softgrasp.fem.obstacles.obstacle import Obstacle, check_passage
 from softgrasp.fem.obstacles.responses import Responses
 from softgrasp.fem.obstacles.small import DependentProblem, SmallProblem
 from softgrasp.fem.obstacles.spacing import edge_parts
 from softgrasp.fem.petsc import Array, rows_on_all
+from softgrasp.fem.run.contact.planes import Planes
 from softgrasp.fem.run.contact.record import ContactRecord, Tables
 from softgrasp.fem.run.contact.rows import Flags, Ints, Rows
 from softgrasp.fem.run.contact.strike import Strike
@@ -91,6 +92,7 @@ class Contact:
         self.small = self.make_problem()
         self.z, self.low, self.moved, self.forces = (np.zeros(self.p * self.d) for _ in range(4))
         self.gaps = self.after = np.zeros((len(self.obstacles), self.p))
+        self.planes = Planes(self.obstacles, self.dt, STRAIGHT * self.layout.extent, self.gaps > 0)
         self.fastest = 0.0  # largest velocity of a boundary node in a step with contact [m/s]
         self.drive: Driven | None = None
         self.n = 0  # number of the step in work
@@ -193,19 +195,21 @@ class Contact:
         tol = self.tolerance(free)
         known = self.after < 0
         known[self.rows.obstacle, self.rows.node] = True
-        x1, active = free, known & False
+        x1, active, self.planes.kept = free, known & False, known & False
         active[self.rows.obstacle, self.rows.node] = True
-        for _ in range(MOST):
+        for count in range(MOST):
             f, rows = self._forces(known, active, n, x0, free, x1, tol)
             x1 = free + self._correction(f)
             after = self._gaps(x1, n + 1)
             new = (after < -tol) & ~known
             pressed = rows.x > 0
-            reached = np.abs(after[rows.obstacle, rows.node])[pressed].max(initial=0.0)
+            left = self.planes.left(rows, n, x0, x1, self.gaps, after)
+            reached = np.abs(left)[pressed].max(initial=0.0)
             if after.min() >= -tol and reached <= tol:  # rows without force too: their normals turn
                 self.after = after
                 return f, rows.take(pressed)
             known |= new
+            self.planes.keep(rows, np.where(pressed, np.abs(left), -left) > tol, count)
             active[:] = False
             active[rows.obstacle[pressed], rows.node[pressed]] = True
         raise unsettled(max(float(reached), -float(after.min())))
@@ -233,20 +237,8 @@ class Contact:
         return C.T @ rows.x, rows
 
     def _look_along(self, rows: Rows, n: int, x0: Array, free: Array, x1: Array) -> Array:
-        """Set the mean normals of rows between x0 and x1; half their gaps at the free end, (k,) [m]."""
-        q = self.after[rows.obstacle, rows.node] / 2
-        for o, obstacle in enumerate(self.obstacles):
-            mine = np.flatnonzero(rows.obstacle == o)
-            i = rows.node[mine]
-            if isinstance(obstacle.shape, HalfSpace):
-                rows.normal[mine] = obstacle.shape.normal
-                continue
-            begin, end = (x[i] - obstacle.shift(t * self.dt) for x, t in ((x0, n), (x1, n + 1)))
-            normal = mean_normal(obstacle.shape, begin, end, STRAIGHT * self.layout.extent)
-            rows.normal[mine] = normal
-            q[mine] = self.gaps[o, i] / 2
-            q[mine] += np.einsum("ij,ij->i", normal, free[i] - obstacle.shift((n + 1) * self.dt) - begin) / 2
-        return q
+        """See :meth:`Planes.look_along`."""
+        return self.planes.look_along(rows, n, x0, free, x1, self.gaps, self.after)
 
     def select(self, responses: Responses, pairs: Ints, normal: Array) -> Array:
         """Shares (k, m) of all responses in unit forces along normals (k, d) of pairs of obstacle and node, (k, 2).
@@ -317,6 +309,8 @@ class Contact:
             mine = rows.obstacle == o
             normal[mine] = obstacle.normal(x[mine], n * self.dt)
             v[mine] -= obstacle.rate(n * self.dt)
+        kept = self.planes.kept[rows.obstacle, rows.node]
+        normal[kept] = rows.normal[kept]
         self.fastest = max(self.fastest, float(np.abs(v).max()))
         # slower than the rounding of a place in half a step is at rest
         self._halt(state, n, rows, normal, v, max(STILL * self.fastest, self.s * self.tolerance(x)))

@@ -285,11 +285,11 @@ def test_three_dimensions_and_higher_orders_close_their_balance() -> None:
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("shape", BLUNT)
 def test_nodes_that_pass_an_edge_within_a_step_stay_outside(shape: str, friction: float) -> None:
-    """Their normals turn from face to face between the rounds, also of nodes that carry no force."""
+    """Normals turn from face to face between rounds, also without force; on the frustum without end, but for planes."""
     result = simulate(
         build(
             "block_3d",
-            ["tissue.cells=[3, 3, 3]", "tissue.order=1", "tissue.refine=false", ON, "time={steps=30, end=0.3}",
+            ["tissue.cells=[3, 3, 3]", "tissue.order=1", "tissue.refine=false", ON, "time={steps=60, end=0.3}",
              "time.start='rest'", "effects.rotation=false", "effects.reaction=false",
              "effects.gravity={g=[0, 0, -9.81]}",
              "motion={profile='quintic', target=[0.02, 0.01, -0.001], duration=0.3}",
@@ -299,6 +299,7 @@ def test_nodes_that_pass_an_edge_within_a_step_stay_outside(shape: str, friction
     assert result.contact.touching.max() > 3
     assert result.energy_drift < 1e-13  # rounding: measured 3e-15
     assert result.contact.penetration < 1e-14  # of a body of 0.05 m: rounding of its places
+    assert min(result.contact.touch, result.contact.stopped, result.contact.rubbed) >= 0  # an obstacle at rest
 
 
 def test_the_force_on_a_prescribed_hand_takes_in_the_contact() -> None:

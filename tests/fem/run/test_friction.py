@@ -37,6 +37,7 @@ def table(friction: float) -> str:
 
 
 DISC = "obstacle=[{kind='disc', center=[0.4, -0.53], radius=0.5, friction=0.4}]"
+TIP = "obstacle=[{kind='polygon', points=[[0.2, -0.6], [0.8, -0.6], [0.5, -0.03]], friction=0.4}]"  # meets a node
 CARRIED = (
     "obstacle=[{kind='box', lo=[-1, -0.53], hi=[3, -0.01], friction=0.3, path={velocity=[0.1, 0]}}, "
     "{kind='halfspace', normal=[0, 1], offset=-0.02, friction=0}]"
@@ -185,7 +186,8 @@ def test_sliding_starts_at_mu_times_the_weight() -> None:
 
 @pytest.mark.ranks(2)
 @pytest.mark.parametrize(
-    "overrides", [[table(0.4), SIDE], [table(5.0), SIDE], [DISC, SIDE], [table(0.3), *DRIVEN], [CARRIED, SIDE]]
+    "overrides",
+    [[table(0.4), SIDE], [table(5.0), SIDE], [DISC, SIDE], [table(0.3), *DRIVEN], [CARRIED, SIDE], [TIP, *DRIVEN]],
 )
 def test_balance_closes_and_friction_dissipates(overrides: list[str]) -> None:
     result = run(BETA, *overrides)
