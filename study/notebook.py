@@ -26,6 +26,7 @@ from softgrasp.reduction.reduce import errors, replay
 from softgrasp.reduction.replay import full_run, replay_inputs
 from softgrasp.study.control.plots import bode
 from softgrasp.study.pictures import MOST_FRAMES, histories, move_bytes
+from softgrasp.study.pictures.contact import contact_figure
 from softgrasp.study.pictures.style import CYCLE, FULL, WIDTH, length_unit, log_axis, paper_style
 from softgrasp.study.pictures.traces import traces
 from softgrasp.study.pictures.turning import Scene3D
@@ -57,6 +58,16 @@ def reduced(run: ReducedTrajectory) -> Any:
 def loop(run: LoopTrajectory) -> Any:
     """Outputs and inputs over time. Not collective."""
     return _free(histories(run.times, run.outputs, run.inputs, run.columns, dimension=_space(run)))
+
+
+def contact(run: Trajectory | LoopTrajectory) -> Any:
+    """Force, gap and touching nodes of each obstacle over time. Not collective.
+
+    Raises SoftgraspError: the scene has no obstacles.
+    """
+    if run.contact is None:
+        raise SoftgraspError("the run had no obstacles; set effects.obstacles and [[obstacle]]")
+    return _free(contact_figure(run.times, run.contact))
 
 
 def loop_bode(margins: LoopMargins) -> Any:

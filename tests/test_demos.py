@@ -12,7 +12,7 @@ pytestmark = pytest.mark.ranks(2)
 
 ROOT = Path(__file__).parents[1]
 DEMOS = sorted((ROOT / "demos").glob("demo_*.py"))
-LONG = ("demo_own_basis", "demo_certified", "demo_finite_strain", "demo_arm")  # 3 to 11 s on one rank
+LONG = ("demo_own_basis", "demo_certified", "demo_finite_strain", "demo_arm", "demo_contact")  # 3 to 11 s on one rank
 
 
 @pytest.mark.parametrize(

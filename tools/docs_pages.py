@@ -32,6 +32,7 @@ ORDER = (
     "control",
     "effects",
     "turn",
+    "contact",
     "arm",
     "ranks",
 )  # of the gallery

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -14,7 +15,12 @@ from softgrasp.study.pictures.style import COLUMN, CYCLE, STEPS, length_unit, pa
 
 
 def figure_contact(times: Array, contact: ContactRecord, out_png: Path) -> tuple[Path, ...]:
-    """Length of the force, each step's thin and the mean of two bold, gap, and nodes touching; PNG and PDF."""
+    """:func:`contact_figure` as PNG and PDF."""
+    return save(contact_figure(times, contact), out_png)
+
+
+def contact_figure(times: Array, contact: ContactRecord) -> Any:
+    """Length of the force, each step's thin and the mean of two bold, gap, and nodes touching."""
     force, touching = np.linalg.norm(contact.force, axis=2), contact.touching
     even = np.linalg.norm(np.vstack([contact.force[:1], (contact.force[1:] + contact.force[:-1]) / 2]), axis=2)
     factor, unit = length_unit(float(np.abs(contact.gap).max()))
@@ -38,4 +44,4 @@ def figure_contact(times: Array, contact: ContactRecord, out_png: Path) -> tuple
             *axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=min(4, len(contact.names))
         )
         figure.align_ylabels(axes)
-        return save(figure, out_png)
+    return figure

@@ -66,6 +66,13 @@ class FullOrderRun(Labelled):
         """
         return drawn("animation", self, model)
 
+    def plot_contact(self) -> Any:
+        """Force, least gap and touching nodes of each obstacle over time, as ``matplotlib`` figure.
+
+        Raises SoftgraspError: the scene has no obstacles.
+        """
+        return drawn("contact", self)
+
     def view3d(self, model: Model) -> Any:
         """The move on the mesh of its model to turn, zoom and play in a notebook, with ``save`` as a page. Collective.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import softgrasp.fem  # noqa: F401
+import softgrasp.fem
 
 # isort: split
 from dataclasses import replace
@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.quiver import Quiver
 
+import softgrasp as sg
 from softgrasp.fem import HalfSpace, Obstacle
 from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.study.pictures.body import draw_surroundings, legend, make_view
@@ -74,3 +75,17 @@ def test_the_legend_has_the_pressure_and_the_path_where_it_shows(way: list[float
     plt.close(figure)
     assert "pressure, at most 2 kPa" in words
     assert ("path of the hand" in words) is seen
+
+
+def test_a_run_draws_force_gap_and_nodes_of_its_obstacles() -> None:
+    run = sg.simulate(sg.build("set_down", ["tissue.cells=[6, 4]", "time.steps=60"]))
+    force, gap, nodes = run.plot_contact().axes
+    assert run.contact is not None
+    gaps = gap.lines[0].get_ydata()
+    assert gaps[0] / gaps.max() == pytest.approx(1.0)  # the block comes down from there
+    np.testing.assert_allclose(gaps, 1e3 * run.contact.gap[:, 0])  # [mm]
+    assert force.lines[0].get_ydata()[-1] == pytest.approx(run.contact.force_end[0, 1], rel=1e-2)  # of the last two steps
+    assert nodes.patches[0].get_data().values[-1] == 7  # all vertices of the bottom
+    free = sg.simulate(sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=6"]))
+    with pytest.raises(sg.fem.SoftgraspError, match="no obstacles"):
+        free.plot_contact()
