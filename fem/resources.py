@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import resource
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import psutil
@@ -15,10 +13,6 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import ResourceError, raise_on_all_ranks
 
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # parameters of mallopt
-# Blocks of more bytes are returned to the system when they are freed: in a block of `kept_memory`, and elsewhere, where
-# it is the largest that glibc comes to by itself.
-KEPT, USUAL = 2**30, 2**25
 MARGIN = 2**18  # bytes: tables of contents that the libraries add, more when they close a file
 CONTAINER = Path("/sys/fs/cgroup")
 
@@ -39,27 +33,6 @@ def free_memory() -> int:
             continue
         free = min(free, max(most - taken + _entry(CONTAINER / table, key), 1))
     return free
-
-
-@contextmanager
-def kept_memory() -> Iterator[None]:
-    """A block of code in which memory that is freed stays with the process, for glibc; at its end it is returned.
-
-    The system clears every page that it gives: a quarter of the time of a factorisation, and more where several ranks
-    request pages at a time.
-    """
-    libc = ctypes.CDLL(None)
-    if not (hasattr(libc, "mallopt") and hasattr(libc, "malloc_trim")):
-        yield
-        return
-    libc.mallopt(MMAP_THRESHOLD, KEPT)
-    libc.mallopt(TRIM_THRESHOLD, KEPT)
-    try:
-        yield
-    finally:
-        libc.mallopt(MMAP_THRESHOLD, USUAL)
-        libc.mallopt(TRIM_THRESHOLD, 2 * USUAL)
-        libc.malloc_trim(0)
 
 
 def size_text(size: float) -> str:

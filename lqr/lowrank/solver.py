@@ -11,7 +11,6 @@ from typing import ClassVar
 import numpy as np
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.resources import kept_memory
 from softgrasp.lqr.lowrank.compress import compress
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.residual import residual
@@ -63,11 +62,10 @@ class LowRankSolver[Start](ABC):
         start = self.prepare(plant)
         seconds = {"start": time.perf_counter() - begin}
         tissue = self.tissue_solver(plant, start)
-        with kept_memory():  # factors and factors' columns come and go
-            try:
-                iterate = self.iterate(plant, tissue, start)
-            finally:
-                tissue.destroy()
+        try:
+            iterate = self.iterate(plant, tissue, start)
+        finally:
+            tissue.destroy()
         counts = {"newton_steps": 0, "adi_steps": 0, "factorisations": tissue.factors} | iterate.counts
         seconds |= iterate.seconds | tissue.seconds
         middle, n = time.perf_counter(), plant.n_local

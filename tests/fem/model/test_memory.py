@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import resource
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -126,23 +124,6 @@ def test_no_machine_decides_which_solver_runs(monkeypatch: pytest.MonkeyPatch) -
     lean = make_scene(CUBE, {"tissue": {"order": 2}, "time": {"steps": 1000}, "output": {"memory": allowed}})
     check_memory(lean, MPI.COMM_SELF, True, 3, cells)
     assert chosen(lean, work)[0] == "stars"
-
-
-@pytest.mark.serial
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="not glibc")
-def test_memory_that_is_freed_stays_for_a_while() -> None:
-    """The system gives a page at the first touch: page faults count what it has cleared."""
-
-    def faults() -> int:
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-        for _ in range(4):
-            b"x" * (64 * 2**20)
-        return (resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) * resource.getpagesize() // 2**20
-
-    assert faults() > 200  # of 256 MiB, each block anew
-    with resources.kept_memory():
-        assert faults() < 80  # one block's, and a few pages
-    assert faults() > 200
 
 
 @pytest.mark.parametrize(
