@@ -178,6 +178,16 @@ static void carry(const Flat *f, int n) {
     if (f->x[j] != 0) add_to_r(f, j, f->x[j]);
 }
 
+/* Count rows whose touching takes back in step n its change in the step before; rows that never met do not touch. */
+static void count_back(const Flat *f, int n) {
+  for (int j = 0; j < f->k; j += 1 + f->m) {
+    const int *row = f->row + 4 * j, on = f->pressed && f->x[j] > 0;
+    char *lately = f->lately + (size_t)row[0] * f->p + row[1];
+    const int changes = on != (*lately & 1);
+    f->chattering[(size_t)n * f->obstacles + row[0]] += changes && *lately & 2;
+    *lately = on | changes << 1;
+  }
+}
 
 /* Let a hand that feels the tissue feel the forces that the step has taken in. */
 static void push(const Flat *f, int n) {
@@ -260,6 +270,7 @@ int softgrasp_step(Flat *f, int n) {
 int softgrasp_finish(Flat *f, int n, const double *v) {
   double most = 0;
   carry(f, n);
+  count_back(f, n);
   if (!f->pressed) return 0;
   const double *qdot = f->vs + (size_t)(n + 1) * f->n_s;
   for (int u = 0; v && u < f->p * f->d; u++) f->v[u] = v[f->rows[u]];

@@ -33,6 +33,7 @@ typedef struct {
   double *level, *rate;     /* n.x of the half-spaces at the end of the step (obstacles), velocities (obstacles, d) */
   double *gap, *after;      /* gaps before and at the end of the step (obstacles, p) */
   char *entered;            /* whether a pair has a row (obstacles, p) */
+  char *lately;             /* 1 of a pair that touched in the last step, and 2 where that changed then (obstacles, p) */
   double *least;            /* least gaps at the end (obstacles) */
   const int *row;           /* obstacle, node, column and direction of each contact row, 0 for the normal (k, 4) */
   const int *kind;          /* sets of the pairs, see friction.c; 0 without friction */
@@ -69,6 +70,6 @@ typedef struct {
   const double *reach, *X_hand; /* N (T - M^-1 G) (struck, n_s), M^-1 G here (n_s, here) */
   const double *H, *GX;     /* (M_hand + M_rigid - G'M^-1 G)^-1, G'M^-1 G (n_s, n_s) */
   double *pulled;           /* G'v before the impulse (n_s) */
-  double *force, *impulse, *touching, *hand, *kick, *gaps; /* tables of the run, see Tables */
+  double *force, *impulse, *touching, *chattering, *hand, *kick, *gaps; /* tables of the run, see Tables */
   double *energy;           /* work, energy dissipated at first touch, by impulses, by friction (4) */
 } Flat;

@@ -115,8 +115,9 @@ class FlatContact(Contact):
             modes=np.ascontiguousarray(self.surface.T.T), places=np.zeros(size),
             w=m.w_array, r=m.r_array, z=self.z, low=self.low, moved=self.moved, v=self.v, q=self.q,
             slide=self.slide, level=self.level, rate=self.rate, gap=self.gaps, after=self.after,
-            entered=self.entered, least=self.least, force=table.force, impulse=table.impulse, touching=table.touching,
-            hand=table.hand, kick=table.kick, gaps=table.gap, energy=table.energy,
+            entered=self.entered, least=self.least, lately=table.lately, force=table.force, impulse=table.impulse,
+            touching=table.touching, chattering=table.chattering, hand=table.hand, kick=table.kick, gaps=table.gap,
+            energy=table.energy,
         )  # fmt: skip
 
     def _describe_hand(self) -> None:

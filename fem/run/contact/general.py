@@ -81,7 +81,7 @@ class Contact:
         self.obstacles = make_obstacles(model.scene, self.layout.dimension)
         self.surface = contact_surface(model)
         self.p, self.d = self.surface.X.shape
-        self.table = Tables.empty(steps, len(self.obstacles), self.d, self.layout.n_s)
+        self.table = Tables.empty(steps, len(self.obstacles), self.p, self.d, self.layout.n_s)
         self.whole, places = midpoint.operators.whole, self.surface.rows
         if self.whole:
             places = np.argsort(midpoint.operators.enter(np.arange(self.layout.n_e)))[self.surface.dofs]
@@ -290,6 +290,7 @@ class Contact:
             assert self.drive is not None
             self.gaps = self._gaps(self.surface.places(self.drive.q[n + 1], self.z), n + 1)  # the bits of a restart
         self.table.gap[n + 1] = self.gaps.min(axis=1)
+        self.table.count_back(n, self.rows.obstacle, self.rows.node)
         if len(self.rows.node):
             self._carry()
             self._stop(state, n + 1)
@@ -355,8 +356,8 @@ class Contact:
         """The record of the run."""
         table, (work, touch, stopped, rubbed) = self.table, self.table.energies.tolist()
         return ContactRecord(
-            tuple(o.name for o in self.obstacles), table.force, table.impulse, table.gap, table.touching, work, touch,
-            stopped, rubbed, self.small.rounds, self.responses.count, self.p,
+            tuple(o.name for o in self.obstacles), table.force, table.impulse, table.gap, table.touching,
+            table.chattering, work, touch, stopped, rubbed, self.small.rounds, self.responses.count, self.p,
         )  # fmt: skip
 
     def restart_arrays(self) -> dict[str, Array]:
@@ -364,7 +365,7 @@ class Contact:
         keys = self.responses.keys[: self.responses.count]
         parts: list[NDArray[Any]] = [
             self.table.sums.ravel(), np.array([self.fastest]), self.small.tally, keys.ravel(),
-            np.array(self.responses.blocks), self.strike.nodes(), *self._sets(),
+            np.array(self.responses.blocks), self.strike.nodes(), self.table.lately.ravel(), *self._sets(),
         ]  # fmt: skip
         sizes = np.array([len(parts), *(len(part) for part in parts)])
         return {"solver_rows": self.table.packed(self.n + 1), "solver_numbers": np.concatenate([sizes, *parts])}
@@ -378,10 +379,11 @@ class Contact:
         self.table.unpack(rows)
         count = 1 + int(numbers[0])
         ends = np.cumsum(numbers[1:count].astype(int))
-        energy, fastest, tally, keys, blocks, struck, *sets = np.split(numbers[count:], ends)[:-1]
+        energy, fastest, tally, keys, blocks, struck, lately, *sets = np.split(numbers[count:], ends)[:-1]
         self.table.sums[:], self.fastest, self.small.tally[:] = energy.reshape(2, 4), float(fastest[0]), tally
         self.responses.again([(int(i), int(k)) for i, k in keys.reshape(-1, 2)], blocks.astype(int).tolist())
         self.strike.restore(struck.astype(int))
+        self.table.lately[:] = lately.reshape(self.table.lately.shape)
         self._resume(sets)
 
     def _resume(self, sets: list[Array]) -> None:

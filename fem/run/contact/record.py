@@ -27,6 +27,9 @@ class ContactRecord(Shown):
     """Least gap between boundary nodes and each obstacle, (steps + 1, obstacles) [m]."""
     touching: NDArray[Any]
     """Number of boundary nodes that each obstacle presses in each step, (steps, obstacles)."""
+    chattering: NDArray[Any]
+    """Number of boundary nodes whose touching each obstacle takes back in each step, (steps, obstacles): it changed in
+    the step before."""
     work: float
     """Work of the contact on the tissue in the frame of the hand, impulses included [J]."""
     touch: float
@@ -49,13 +52,11 @@ class ContactRecord(Shown):
 
     @property
     def chatter(self) -> int:
-        """Changes of the numbers of touching nodes that the next step takes back, in the whole run.
+        """Changes of a node's touching that the next step takes back, in the whole run.
 
-        Nodes that leave count against others that begin to touch in the same step.
+        A node touches an obstacle in a step whose force on it, constant in the step, is positive.
         """
-        change = np.diff(self.touching, axis=0, prepend=0.0)
-        back = np.minimum(np.abs(change[1:]), np.abs(change[:-1]))
-        return int(back[change[1:] * change[:-1] < 0].sum())
+        return int(self.chattering.sum())
 
     @property
     def force_end(self) -> Array:
@@ -74,18 +75,31 @@ class Tables:
     impulse: Array  # impulses, (steps, obstacles, d) [N s]
     gap: Array  # least gaps, (steps + 1, obstacles) [m]
     touching: Array  # numbers of pressed nodes, (steps, obstacles)
+    chattering: Array  # numbers of nodes whose touching takes back its change in the step before, (steps, obstacles)
     hand: Array  # force of the contact in the freedoms of the hand, impulses included, (steps, n_s) [N, N m]
     kick: Array  # G'u for the jump u of the velocity by each impulse, (steps, n_s) [N s, N m s]
     energy: Array  # work, and energy dissipated at first touch, by impulses and by friction, in a step, (4,) [J]
     sums: Array  # of ``energy`` over the steps, and what rounding of these sums lost, (2, 4) [J]
+    lately: NDArray[np.int8]  # 1 of nodes that touched in the last step, and 2 where that changed then, (obstacles, p)
 
     @staticmethod
-    def empty(steps: int, obstacles: int, d: int, n_s: int) -> Tables:
+    def empty(steps: int, obstacles: int, p: int, d: int, n_s: int) -> Tables:
         """Room for all steps."""
         force, impulse = np.zeros((2, steps, obstacles, d))
         hand, kick = np.zeros((2, steps, n_s))
-        gap, touching = np.zeros((steps + 1, obstacles)), np.zeros((steps, obstacles))
-        return Tables(force, impulse, gap, touching, hand, kick, np.zeros(4), np.zeros((2, 4)))
+        gap, (touching, chattering) = np.zeros((steps + 1, obstacles)), np.zeros((2, steps, obstacles))
+        energy, sums, lately = np.zeros(4), np.zeros((2, 4)), np.zeros((obstacles, p), dtype=np.int8)
+        return Tables(force, impulse, gap, touching, chattering, hand, kick, energy, sums, lately)
+
+    def count_back(self, n: int, obstacle: NDArray[np.intp], node: NDArray[np.intp]) -> None:
+        """Count what takes back its last change in step n, where these pairs of obstacle and node, (k,), touch."""
+        if not len(node) and not self.lately.any():
+            return
+        on = np.zeros(self.lately.shape, dtype=bool)
+        on[obstacle, node] = True
+        changes = on != (self.lately & 1)
+        self.chattering[n] = (changes & (self.lately > 1)).sum(axis=1)
+        self.lately[:] = on + 2 * changes
 
     def add(self) -> None:
         """Add the energies of a step to the sums, and keep what rounding loses."""
@@ -101,7 +115,7 @@ class Tables:
         return np.asarray(self.sums.sum(axis=0))
 
     def _tables(self) -> tuple[Array, ...]:
-        return self.force, self.impulse, self.gap, self.touching, self.hand, self.kick
+        return self.force, self.impulse, self.gap, self.touching, self.chattering, self.hand, self.kick
 
     def packed(self, n: int) -> Array:
         """The first n rows of all tables side by side, (n, numbers)."""

@@ -28,7 +28,7 @@ from softgrasp.fem.shown import counted
 
 FORMAT = 8
 FRICTION = 5  # form of the sets of friction in them
-CONTACT = 4  # form of what contact carries on
+CONTACT = 5  # form of what contact carries on
 ITERATIONS = 2  # form of the iterations of steps at finite strain or in a frame
 COMPILED = "compiled contact"
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # keys of [output] that change no number of a run
