@@ -14,6 +14,8 @@ from mpi4py import MPI
 
 from softgrasp.fem import Model, PETSc, Run, RunOptions, make_ts
 
+TICK = 0.01  # s, by which the coarsest systems count processor time
+
 
 def timed(comm: MPI.Intracomm, call: Callable[[], Any]) -> float:
     """Seconds of a call on the slowest rank, after a collection of garbage. Collective."""
@@ -43,13 +45,13 @@ def median_seconds(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int) -
 def processor_seconds(comm: MPI.Intracomm, call: Callable[[], Any]) -> float:
     """Processor time of a call on the rank that takes most; other programs hardly change it. Collective.
 
-    Where the system counts it in ticks, a call that is shorter than one has the seconds of the clock.
+    Where the system counts it in ticks, a call within one has the seconds of the clock, at most those of a tick.
     """
     comm.Barrier()
     begin, clock = time.process_time(), time.perf_counter()
     call()
     spent, passed = time.process_time() - begin, time.perf_counter() - clock
-    return float(comm.allreduce(spent if spent > 0 else passed, MPI.MAX))
+    return float(comm.allreduce(spent if spent > 0 else min(passed, TICK), MPI.MAX))
 
 
 def median_processor_seconds(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int) -> float:

@@ -16,4 +16,5 @@ def test_a_short_call_takes_time_where_the_system_counts_in_ticks(tick: float, m
     own = time.process_time
     monkeypatch.setattr(time, "process_time", lambda: own() // tick * tick if tick else own())
     assert processor_seconds(MPI.COMM_SELF, lambda: None) > 0
+    assert processor_seconds(MPI.COMM_SELF, lambda: time.sleep(0.1)) < 0.05  # which takes no processor time
     assert median_processor_seconds(MPI.COMM_SELF, lambda: None, 3) > 0
