@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # scenes are read without MPI
     from mpi4py import MPI
@@ -51,6 +51,17 @@ class SoftgraspError(Exception):
 
     def __str__(self) -> str:
         return one_line(super().__str__())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For another rank or process: a subclass whose call takes more than a text is made without it."""
+        return _again, (type(self), self.args, self.__dict__)
+
+
+def _again(kind: type[SoftgraspError], args: tuple[Any, ...], facts: dict[str, Any]) -> SoftgraspError:
+    """The error with these arguments and attributes."""
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(facts)
+    return error
 
 
 class SoftgraspWarning(RuntimeWarning):

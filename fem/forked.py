@@ -1,4 +1,4 @@
-"""A share of work that a forked process does while this one goes on computing."""
+"""A share of work that a forked process does while this one computes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import os
 import pickle
 import signal
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkProcess
@@ -18,6 +18,8 @@ from typing import Any, Literal, Self
 
 import psutil
 from mpi4py import MPI
+
+from softgrasp.fem.resources import cores
 
 Pause = Callable[[Any], Any]
 """Called by the other process with what :meth:`Forked.wait` returns; returns what :meth:`Forked.go_on` is given."""
@@ -93,7 +95,7 @@ def forked[T](call: Callable[[Pause], T], same: Sequence[object] = ()) -> Forked
         call: gets a function that pauses until this process lets it go on.
         same: objects that need not or cannot be packed.
     """
-    if MPI.COMM_WORLD.size > 1 or len(os.sched_getaffinity(0)) < 2:
+    if MPI.COMM_WORLD.size > 1 or cores() < 2:
         return None
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe()
@@ -106,6 +108,39 @@ def forked[T](call: Callable[[Pause], T], same: Sequence[object] = ()) -> Forked
         return None
     there.close()
     return Forked(process, here, same)
+
+
+def shared[T](
+    own: Sequence[Callable[[], T]], beside: Sequence[Callable[[], T]], same: Sequence[object] = ()
+) -> list[T]:
+    """Results of the calls ``own``, then of ``beside``, which a forked process begins with. Not collective.
+
+    Whoever is done with its calls goes on with those of the other from their end, so that both end at about the same
+    time on whatever cores. Without another process, see :func:`forked`, or where it is lost, this one makes all.
+
+    ``same``: objects in the results that need not or cannot be packed.
+
+    Raises Exception: that of a call.
+    """
+    calls = [*own, *reversed(beside)]
+    left, put = os.pipe()  # a byte for each call that nobody has begun; both take from opposite ends
+    os.write(put, bytes(len(calls)))
+    os.close(put)
+
+    def made(order: Iterable[int]) -> dict[int, T]:
+        return {i: calls[i]() for i in order if os.read(left, 1)}
+
+    try:
+        other = forked(lambda pause: made(reversed(range(len(calls)))), same) if own and beside else None
+        with other or nullcontext():
+            found = made(range(len(calls)))
+            if other is not None:
+                with suppress(OSError):
+                    found |= other.result()
+    finally:
+        os.close(left)
+    every = [found[i] if i in found else call() for i, call in enumerate(calls)]
+    return [*every[: len(own)], *reversed(every[len(own) :])]
 
 
 def _comes(pipe: Connection, pid: int | None) -> bool:

@@ -1,4 +1,4 @@
-"""Free memory, and free disk space before fields are written: their libraries end the program on a full disk."""
+"""Cores, free memory, and free disk space before fields are written: their libraries end the program on a full disk."""
 
 from __future__ import annotations
 
@@ -15,6 +15,11 @@ from softgrasp.fem.errors import ResourceError, raise_on_all_ranks
 
 MARGIN = 2**18  # bytes: tables of contents that the libraries add, more when they close a file
 CONTAINER = Path("/sys/fs/cgroup")
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def free_memory() -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from softgrasp.fem.errors import ResourceError, SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, Complex, PETSc, from_options, petsc_options, whole_copy
-from softgrasp.fem.resources import free_memory
+from softgrasp.fem.resources import cores, free_memory
 from softgrasp.fem.solve.cholesky import direct_solves, package_of
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.lowrank.ahead import FactorsAhead
@@ -128,7 +127,7 @@ class GatheredTissue(ShiftedTissue):
         self.cache: Factors = {}
         self.ahead: FactorsAhead | None = None
         threads = THREADS[layout.dimension]
-        if MPI.COMM_WORLD.size == 1 and layout.n_e >= AHEAD_FROM and _cores() > 1:
+        if MPI.COMM_WORLD.size == 1 and layout.n_e >= AHEAD_FROM and cores() > 1:
             self.ahead = FactorsAhead(self._make, threads)
         # one for each thread, filled anew for each shift, because making one checks its indices
         self.shells = [scipy.sparse.csc_matrix(self.K) for _ in range(1 if self.ahead is None else threads)]
@@ -242,11 +241,6 @@ class GatheredTissue(ShiftedTissue):
         self._forget()
         if self.ahead is not None:
             self.ahead.close()
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _lu_solve(

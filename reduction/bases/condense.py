@@ -39,20 +39,21 @@ def condensed(states: States) -> States:
     """
     states.check()
     begin = time.thread_time()
-    runs = tuple((system, condense(snapshots).few) for system, snapshots in states.runs)
+    pairs = [(system, snapshots, condense(snapshots)) for system, snapshots in states.runs]
+    runs = tuple((system, made.few if made else snapshots) for system, snapshots, made in pairs)
     return States(states.system, runs, time.thread_time() - begin)
 
 
-def condense(snapshots: Snapshots) -> Condensed:
-    """Few columns of finite snapshots, or all of them where few would not pay. Collective."""
-    made: Condensed | None = snapshots.kept.get(Condensed)
-    if made is not None:
+def condense(snapshots: Snapshots) -> Condensed | None:
+    """Few columns of finite snapshots, which keep them; None where they would not pay. Collective."""
+    made: Condensed | None = None
+    if Condensed in snapshots.kept:
+        made = snapshots.kept[Condensed]
         return made
     comm, n, m = snapshots.layout.comm, snapshots.layout.n_local, snapshots.Z.shape[1]
     q_s, v_s = snapshots.q_s, snapshots.v_s
     blocks = [triangle(comm, snapshots.Z[:n]), triangle(comm, snapshots.Z[n:]), q_s, v_s]
     blocks = [block / np.abs(block).max() for block in blocks if np.any(block)]
-    few, W = snapshots, np.eye(m)
     if blocks:
         R = np.vstack([block / np.linalg.norm(block) for block in blocks])
         _, s, W_h = small_svd(comm, np.linalg.qr(R, mode="r"))
@@ -60,5 +61,6 @@ def condense(snapshots: Snapshots) -> Condensed:
         if r <= GAIN * m:
             W, Z = np.ascontiguousarray(W_h[:r].T), (W_h[:r] @ snapshots.Z.T).T
             few = Snapshots(snapshots.layout, snapshots.steps[:r], snapshots.times[:r], q_s @ W, v_s @ W, Z)
-    snapshots.kept[Condensed] = made = Condensed(few, W)
+            made = Condensed(few, W)
+    snapshots.kept[Condensed] = made
     return made

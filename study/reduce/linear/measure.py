@@ -14,7 +14,6 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem import Reduction, Scene
-from softgrasp.fem.forked import Pause, forked
 from softgrasp.reduction import Basis, ModelComparison, ModelError, ReducedModel, project_scene, registry
 from softgrasp.reduction.bases.condense import condensed
 from softgrasp.reduction.bases.states import BasisError, States, states_of
@@ -24,7 +23,7 @@ from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, tra
 from softgrasp.reduction.propagator import Propagator
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
 from softgrasp.study.reduce.linear.bases import Made, bases_of, made_apart, shares_of, small
-from softgrasp.study.reduce.linear.ranks import dealt
+from softgrasp.study.reduce.linear.ranks import dealt, divided
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
     LARGER,
@@ -99,7 +98,7 @@ class Measured:
 
     def light(self, full: FullRun) -> Measured:
         """The same without rows on the mesh, unless a new run needs them for its start."""
-        if full.model.scene.time.start == "equilibrium":
+        if full.model.scene.time.start == "equilibrium" and "force" in self.drive:
             return self
         return replace(self, model=replace(self.model, reconstruction=None))
 
@@ -149,9 +148,12 @@ class Untimed:
     N_energy: int | None
     bases: tuple[tuple[np.ndarray, ...], str]  # singular values and inner product
 
-    def timed(self, full: FullRun) -> MethodSweep:
-        """The method with its times. Collective."""
-        points = tuple(each.timed(full) for each in self.found)
+    def times(self, full: FullRun) -> tuple[Point, ...]:
+        """Its points with times. Collective."""
+        return tuple(each.timed(full) for each in self.found)
+
+    def sweep(self, points: tuple[Point, ...]) -> MethodSweep:
+        """The method with these points."""
         models = {each.model.N: each.model for each in self.found if each.model.N in kept_points(points)}
         sigma, inner = self.bases
         refused = dict(sorted(self.refused.items()))
@@ -189,7 +191,8 @@ def sweep(
     name: str, full: FullRun, options: Reduction, progress: Progress = lambda done, of: None, made: Made | None = None
 ) -> MethodSweep:
     """One method at all its N, as :func:`untimed`, with its times. Collective. Raises SolverError: as there."""
-    return untimed(name, full, options, progress, made).timed(full)
+    found = untimed(name, full, options, progress, made)
+    return found.sweep(found.times(full))
 
 
 def sweep_all(
@@ -201,8 +204,8 @@ def sweep_all(
 ) -> tuple[MethodSweep, ...]:
     """Every method at all N of the options, None for those of the scene. Collective.
 
-    On one rank with a free core a forked process makes and measures the bases of some of the methods. Times are taken
-    afterwards, by one process at a time. ``ranks``: that divide the methods, with the whole run each.
+    On one rank with a free core a forked process makes and measures the bases of some of the methods, but takes no
+    times. ``ranks``: that divide methods and times, with the whole run each.
     """
     options = options or full.model.scene.reduction
     size = len(options.N)
@@ -210,38 +213,20 @@ def sweep_all(
     with suppress(BasisError):  # each method states what is wrong with the snapshots
         states = condensed(every)
     made = made_apart([(name, options.N) for name in names], states, options)
-    same = full.model.system.layout, *map(registry.find_method, names)
-    own, beside = shares_of(names) if len(names) > 1 and small(states) and ranks.size == 1 else (list(names), [])
 
-    def one(name: str, tell: Say) -> Untimed:
+    def one(name: str) -> Untimed:
         def progress(done: int, of: int) -> None:
-            tell(name, size * names.index(name) + size * done // of, size * len(names))
+            say(name, size * names.index(name) + size * done // of, size * len(names))
 
         used = states if name in registry.METHODS else every  # a user's basis may need the columns in time
         return untimed(name, full, options, progress, made.pop(name, None), used)
 
-    def share(pause: Pause) -> list[MethodSweep]:
-        halves = [one(name, lambda what, done, of: None) for name in beside]
-        pause(None)
-        return [half.timed(full) for half in halves]
-
-    def whole(share: Sequence[str]) -> list[MethodSweep]:
-        return [one(name, say).timed(full) for name in share]
-
-    other = forked(share, same) if beside else None
-    if other is None:
-        parts = shares_of(names, ranks.size) if ranks.size > 1 else [list(names)]
-        sweeps = [s for found in dealt(ranks, [partial(whole, part) for part in parts], same) for s in found]
-        return tuple(sorted(sweeps, key=lambda s: names.index(s.method.key)))
-    with other:
-        halves = [one(name, say) for name in own]
-        try:
-            other.wait()
-            sweeps = [half.timed(full) for half in halves] + other.result()
-        except OSError:  # it was lost
-            halves += [one(name, say) for name in beside]
-            sweeps = [half.timed(full) for half in halves]
-    return tuple(sorted(sweeps, key=lambda s: names.index(s.method.key)))
+    parts = shares_of(names, ranks.size if ranks.size > 1 else 2 if small(states) else 1)
+    same = full.model.system.layout, *map(registry.find_method, names)
+    found = divided(ranks, [[partial(one, name) for name in part] for part in parts], same)
+    found.sort(key=lambda each: names.index(each.name))
+    times = dealt(ranks, [partial(each.times, full) for each in found])
+    return tuple(each.sweep(points) for each, points in zip(found, times, strict=True))
 
 
 def box_models(

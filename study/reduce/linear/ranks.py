@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from mpi4py import MPI
 
 from softgrasp.fem import Model, Scene, build
 from softgrasp.fem.errors import raise_on_all_ranks
-from softgrasp.fem.forked import packed, unpacked
+from softgrasp.fem.forked import packed, shared, unpacked
 from softgrasp.fem.model.memory import need
 from softgrasp.study.reduce.linear.bases import WHOLE_BYTES
 
@@ -31,6 +32,24 @@ def of_each_rank(model: Model, scene: Scene) -> tuple[Model, MPI.Intracomm]:
     return own, layout.comm
 
 
+def divided[T](
+    ranks: MPI.Intracomm, shares: Sequence[Sequence[Callable[[], T]]], same: Sequence[object] = ()
+) -> list[T]:
+    """Results of the calls of all shares, one for each rank; on one rank a forked process begins with a second share.
+
+    Collective; the calls must not communicate. ``same``, Raises: as in :func:`dealt`.
+    """
+    if ranks.size == 1:
+        own, *beside = shares
+        return shared(own, [call for share in beside for call in share], same)
+    parts = dealt(ranks, [partial(_in_turn, share) for share in shares], same)
+    return [each for part in parts for each in part]
+
+
+def _in_turn[T](calls: Sequence[Callable[[], T]]) -> list[T]:
+    return [call() for call in calls]
+
+
 def dealt[T](ranks: MPI.Intracomm, calls: Sequence[Callable[[], T]], same: Sequence[object] = ()) -> list[T]:
     """Results of all calls on every rank, each made by one of them. Collective; the calls must not communicate.
 
@@ -39,7 +58,7 @@ def dealt[T](ranks: MPI.Intracomm, calls: Sequence[Callable[[], T]], same: Seque
     Raises Exception: that of the lowest rank with a call that fails.
     """
     if ranks.size == 1:
-        return [call() for call in calls]
+        return _in_turn(calls)
     found: dict[int, T] = {}
     sent = b""
     with raise_on_all_ranks(ranks):

@@ -79,20 +79,14 @@ def write_pull(session: Session, study: ReductionStudy) -> Path | None:
 def begin_to_draw(
     session: Session, full: FullRun, times: FullTimes, sweeps: Sequence[MethodSweep]
 ) -> Callable[[], list[Path]]:
-    """Draw in two processes beside what is measured next; the function returned waits for the pictures. Collective."""
+    """Draw beside what is measured next; the function returned waits for the pictures. Collective."""
     if not session.pictures:
         return list
     views = gather_views(full.model, full, sweeps)
 
-    def errors(folder: Path) -> list[Path]:
-        from softgrasp.study.reduce.linear.plots import draw_errors  # brings Matplotlib
+    def draw(folder: Path) -> list[Path]:
+        from softgrasp.study.reduce.linear.plots import draw_bodies, draw_errors  # bring Matplotlib
 
-        return draw_errors(folder, sweeps, times.steps)
+        return [*draw_errors(folder, sweeps, times.steps), *draw_bodies(folder, views)]
 
-    def bodies(folder: Path) -> list[Path]:
-        from softgrasp.study.reduce.linear.plots import draw_bodies
-
-        return draw_bodies(folder, views)
-
-    begun = [draw_in_background(session.comm, session.out, part) for part in (errors, bodies)]
-    return lambda: [file for files in begun for file in files()]
+    return draw_in_background(session.comm, session.out, draw)

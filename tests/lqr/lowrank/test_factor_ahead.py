@@ -85,7 +85,7 @@ def test_solutions_do_not_depend_on_the_threads(
     alone = GatheredTissue(system)
     assert alone.ahead is None
     monkeypatch.setattr(shifted, "AHEAD_FROM", 0)
-    monkeypatch.setattr(shifted, "_cores", lambda: 2)
+    monkeypatch.setattr(shifted, "cores", lambda: 2)
     helped = GatheredTissue(system)
     assert helped.ahead is not None
     assert len(helped.shells) == len(helped.ahead.threads) == 2

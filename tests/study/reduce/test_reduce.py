@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from softgrasp.fem import forked as processes
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import Need
 from softgrasp.fem.model.outputs import make_outputs
@@ -289,27 +289,31 @@ def test_bases_of_one_rank_are_those_of_all_ranks_together(small: FullRun) -> No
 
 
 @pytest.mark.serial
-@pytest.mark.skipif(len(os.sched_getaffinity(0)) == 1, reason="one core measures all by itself")
 def test_methods_measured_by_another_process_have_the_same_numbers(
     small: FullRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The other process has the bases of this one: the same bits. A process that is lost is replaced."""
+    """The same bits, whoever makes which; this process alone takes times."""
     names, here = ("pod_fixed", "psd_fixed", "psd_svd_like_fixed", "craig_bampton"), os.getpid()
-    own = ["psd_fixed", "psd_svd_like_fixed"]  # share a tall factor
+    (ask, asked), (answer, answered) = os.pipe(), os.pipe()
     measured_here: list[str] = []
 
-    def swept(lost: bool = False) -> list[Any]:
+    def swept(meet: bool) -> list[Any]:
         measured_here.clear()
+        met = dict.fromkeys((True, False), not meet)
 
         def counted(name: str, *args: Any) -> Any:
-            if lost and os.getpid() != here:
-                os.kill(os.getpid(), signal.SIGKILL)
+            own = os.getpid() == here
+            if not met[own]:  # waits in its first call until the other one is in its own
+                met[own] = True
+                os.write(asked if own else answered, b"x")
+                os.read(answer if own else ask, 1)
             measured_here.append(name)
             return untimed(name, *args)
 
         monkeypatch.setattr(measure, "untimed", counted)
         found = measure.sweep_all(names, small, lambda what, done, of: None, wanted(small, [8, 14, 4000]))
-        assert all(m.reconstruction.layout is small.model.system.layout for s in found for m in s.models.values())
+        rows = [m.reconstruction for s in found for m in s.models.values()]
+        assert all(each is not None and each.layout is small.model.system.layout for each in rows)
         assert all(p.time_setup > 0 and p.time_online > 0 for s in found for p in s.points)
         timeless = [
             [{key: value for key, value in asdict(p).items() if not key.startswith("time")} for p in s.points]
@@ -317,13 +321,14 @@ def test_methods_measured_by_another_process_have_the_same_numbers(
         ]
         return [(s.method, s.refused, s.N_energy, points) for s, points in zip(found, timeless, strict=True)]
 
-    shared = swept()
-    assert measured_here == own
-    assert swept(lost=True) == shared
+    monkeypatch.setattr(processes, "cores", lambda: 2)
+    two = swept(meet=True)
+    assert 0 < len(measured_here) < len(names)
+    monkeypatch.setattr(processes, "cores", lambda: 1)
+    assert swept(meet=False) == two
     assert sorted(measured_here) == sorted(names)
-    monkeypatch.setattr(measure, "forked", lambda *args: None)
-    assert swept() == shared
-    assert measured_here == list(names)
+    for end in (ask, asked, answer, answered):
+        os.close(end)
 
 
 # --- other parameters
