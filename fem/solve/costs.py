@@ -48,10 +48,10 @@ REPEATED_RANKS = 4
 # Unknowns from which ranks factor a subtree each in 2D: a solve with 1e5 takes 6.9 ms on two ranks, 11.3 on one, and
 # 12.7 where both have the whole factor; below, the messages and the sum of a step take as long.
 SUBTREES_FROM = 10_000
-# Time of their set-up on two ranks over the model's of one factor [1]: 1.5 and 2.0 with 1e5 and 4e5 unknowns on free
-# cores (0.9 and 9.6 s; one factor 0.55 and 3.6), 2.2 with 1e6 beside other work. SuperLU eliminates each part too.
-SUBTREES_SETUP = 1.9
-SUBTREES_MEMORY = 4.5  # memory of their set-up over that of one factor [1]: 4.4 and 4.8 with 1e5 and 4e5 unknowns
+# Time of their set-up on two ranks over the model's of one factor [1]: 0.57 and 0.51 with 1e5 and 4e5 unknowns (0.34
+# and 2.45 s of processor time; one factor 0.54 and 4.05).
+SUBTREES_SETUP = 0.55
+SUBTREES_MEMORY = 2.1  # memory of their set-up over that of one factor [1]: 2.1 and 2.0 with 1e5 and 4e5 unknowns
 
 
 @dataclass(frozen=True)

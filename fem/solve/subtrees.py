@@ -8,8 +8,9 @@ With I the nodes of a rank that have no neighbour on a higher rank, and G all ot
 A solve is a forward sweep on each rank, one sum of as many numbers as G has rows, a dense solve on every rank and a
 backward sweep; each rank reads the factor of its own part. The sums have a fixed order: a run repeats its bits.
 
-Each rank factors [S_II, S_IG; S_GI, C + t I], which leaves t I on G: its forward sweep from [r_I; 0] ends there with
--S_GI S_II^-1 r_I / t, and its backward sweep may begin there with w_G [GL81].
+Each rank factors [S_II, S_IG; S_GI, S_GG] with the rows G that its part touches. With U and D of the last rows of this
+factor, where S = U'D U, U with ones on its diagonal, U'D U = S_GG - C gives C; its forward sweep y = D^-1 U^-T r from
+[r_I; 0] ends with U'D y = -S_GI S_II^-1 r_I, and its backward sweep may begin with U w_G [GL81].
 """
 
 from __future__ import annotations
@@ -23,8 +24,13 @@ from numpy.typing import NDArray
 from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.petsc import Array, PETSc, to_scipy, total, user_options
 from softgrasp.fem.solve.cholesky import BACKWARD_ERROR, backward_error, make_ksp, nested_dissection, rows_of
+from softgrasp.fem.solve.entries import last_rows
 
 INDEFINITE = "cholesky: the factorisation of the tissue matrix failed; it is not definite: check material and mesh"
+
+
+class NoEntries(Exception):
+    """PETSc does not show the entries of a factor."""
 
 
 class SplitFactor:
@@ -37,9 +43,9 @@ class SplitFactor:
 
     Attributes:
         ksp: solver of this rank's part.
-        top: lower Cholesky factor of Sigma.
+        top: Cholesky factor of Sigma, on every rank.
 
-    Collective. Raises SolverError: S is not definite.
+    Collective. Raises SolverError: S is not definite; NoEntries: see there.
     """
 
     def __init__(self, S: PETSc.Mat, prefix: str, d: int) -> None:
@@ -56,21 +62,16 @@ class SplitFactor:
         sigma, at = total(self.comm, sigma), np.ix_(self.touched, self.touched)
         with raise_on_all_ranks(self.comm):
             parts = rows[self.inner][:, self.inner + first * d], outer[:, self.touched]
-            C = _eliminated(*parts, sigma[at])
-            self.t = float(np.abs(sigma.diagonal()).max(initial=1.0))
-            self.ksp = _factored(_bordered(*parts, C + self.t * np.eye(len(C))), prefix, d)
+            self.ksp = _factored(_bordered(*parts, sigma[at]), prefix, d)
+            self.factor = self.ksp.getPC().getFactorMatrix()
+            self.U, D = _last(self.factor, len(self.touched) // d)
+            self.V = self.U.T @ D
         share = np.zeros_like(sigma)
-        share[at] = C
-        sigma -= total(self.comm, share)
-        from scipy.linalg.lapack import dpotrf, dpotrs  # slow to import, and for ranks in 2D alone
-
-        self.top, failed = dpotrf(sigma, lower=1)
-        if failed:  # on every rank alike
-            raise SolverError(INDEFINITE)
-        self.dpotrs = dpotrs
-        self.factor = self.ksp.getPC().getFactorMatrix()
+        share[at] = sigma[at] - self.V @ self.U
+        self.top = _dense_factor(sigma - total(self.comm, share))
         self.r, self.w = self.factor.createVecs()
-        self.sum, self.share = np.zeros(len(G)), np.zeros(len(G))
+        self.sum, self.solved = self.top.createVecs()
+        self.share = np.zeros(len(G))
 
     def solve(self, r: PETSc.Vec, w: PETSc.Vec) -> None:
         """Solve S w = r. Collective."""
@@ -81,23 +82,26 @@ class SplitFactor:
         self.factor.solveForward(self.r, self.w)
         swept = self.w.array_w
         self.share[:] = 0.0
-        self.share[self.touched] = self.t * swept[n:]
+        self.share[self.touched] = self.V @ swept[n:]
         self.share[self.mine] += rows[self.own]
-        self.comm.Allreduce(self.share, self.sum)
-        solved, _ = self.dpotrs(self.top, self.sum, lower=1)
-        swept[n:] = solved[self.touched]
+        self.comm.Allreduce(self.share, self.sum.array_w)
+        self.top.solve(self.sum, self.solved)
+        solved = self.solved.array_r
+        np.matmul(self.U, solved[self.touched], out=swept[n:])
         self.factor.solveBackward(self.w, self.r)
         result = w.array_w
         result[self.inner], result[self.own] = self.r.array_r[:n], solved[self.mine]
 
     def destroy(self) -> None:
-        """Free the vectors."""
-        self.r.destroy()
-        self.w.destroy()
+        """Free the vectors and the factor of Sigma."""
+        for item in (self.r, self.w, self.sum, self.solved, self.top):
+            item.destroy()
 
 
 def split_factor(S: PETSc.Mat, prefix: str, d: int) -> SplitFactor | None:
     """The factor with a subtree on each rank; None where the user gave options, or blocks lose digits. Collective.
+
+    None too where PETSc does not show what it stores of a factor.
 
     Raises SolverError: S is not definite; it is freed.
     """
@@ -105,6 +109,8 @@ def split_factor(S: PETSc.Mat, prefix: str, d: int) -> SplitFactor | None:
         return None
     try:
         factor = SplitFactor(S, prefix, d)
+    except NoEntries:
+        return None
     except SolverError:
         S.destroy()
         raise
@@ -127,24 +133,29 @@ def _divided(blocks: Any, first: int) -> tuple[NDArray[np.intp], NDArray[np.intp
 
 
 def _bordered(inside: Any, across: Any, border: Array) -> Any:
-    """[S_II, S_IG; S_GI, border], sparse."""
-    return scipy.sparse.bmat([[inside, across], [across.T, scipy.sparse.csr_matrix(border)]], format="csr")
+    """[S_II, S_IG; S_GI, border], sparse, with every entry of the border, be it zero."""
+    k = len(border)
+    corner = scipy.sparse.csr_matrix((border.ravel(), np.tile(np.arange(k), k), np.arange(0, k * k + 1, max(k, 1))))
+    return scipy.sparse.bmat([[inside, across], [across.T, corner]], format="csr")
 
 
-def _eliminated(inside: Any, across: Any, border: Array) -> Array:
-    """C = S_GI S_II^-1 S_IG, dense, from a factor of [S_II, S_IG; S_GI, border], which leaves border - C."""
-    from scipy.sparse.linalg import splu  # slow to import, and for ranks in 2D alone
+def _last(factor: PETSc.Mat, nodes: int) -> tuple[Array, Array]:
+    """U and D of the border. Raises NoEntries: PETSc does not show them."""
+    found = last_rows(factor, nodes)
+    if found is None:
+        raise NoEntries
+    return found
 
-    options = {"SymmetricMode": True, "Equil": False}
+
+def _dense_factor(sigma: Array) -> PETSc.Mat:
+    """The Cholesky factor of Sigma, which every rank has alike. Raises SolverError: it is not definite."""
+    result = PETSc.Mat().createDense(sigma.shape, array=np.asfortranarray(sigma), comm=PETSc.COMM_SELF)
+    result.setOption(PETSc.Mat.Option.SPD, True)
     try:
-        lu = splu(
-            _bordered(inside, across, border).tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options
-        )
-    except RuntimeError as error:
+        result.factorCholesky(PETSc.IS())
+    except PETSc.Error as error:
         raise SolverError(INDEFINITE) from error
-    at = lu.perm_c[inside.shape[0] :]
-    L, U = lu.L[:, at][at], lu.U[:, at][at]
-    return np.asarray(border - (L @ U).toarray())
+    return result
 
 
 def _factored(A: Any, prefix: str, d: int) -> PETSc.KSP:

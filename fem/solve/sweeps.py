@@ -11,13 +11,12 @@ few rows n'w are known after the first sweep, and forces n x may enter y.
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array, PETSc
+from softgrasp.fem.solve.entries import stored
 from softgrasp.fem.solve.solvers import TissueSolver
 
 SAME = 1e-8  # relative difference of r'S^-1 r and y'D y that is no rounding [1]
@@ -44,24 +43,11 @@ def sweeps_of(solver: TissueSolver, d: int) -> Sweeps | None:
     factor = solver.factor
     if not isinstance(factor, PETSc.Mat) or factor.getType() != "seqsbaij" or factor.getBlockSize() != d:
         return None
-    inverse = _first_entries(factor, d)
+    inverse = stored(factor, factor.getSize()[0] // d)
     if inverse is None:
         return None
     sweeps = Sweeps(factor, np.linalg.inv(inverse))
     return sweeps if _true(sweeps) else None
-
-
-def _first_entries(factor: PETSc.Mat, d: int) -> Array | None:
-    """The first nodes x d x d entries that PETSc stores of a factor: D^-1, if it is in blocks; None without access."""
-    try:
-        get = ctypes.CDLL(PETSc.__file__).MatSeqSBAIJGetArray
-    except (OSError, AttributeError):
-        return None
-    entries = ctypes.POINTER(ctypes.c_double)()
-    if PETSc.ScalarType != np.float64 or get(ctypes.c_void_p(factor.handle), ctypes.byref(entries)):
-        return None
-    first: NDArray[np.float64] = np.ctypeslib.as_array(entries, (factor.getSize()[0] // d, d, d))
-    return first.copy()
 
 
 def _true(sweeps: Sweeps) -> bool:

@@ -81,7 +81,7 @@ def test_linear_steps_in_2d_have_a_subtree_on_each_rank() -> None:
     assert work.repeated("cholesky")
     assert not split.repeated("cholesky")
     assert work.memory("cholesky") == 2 * alone.memory("cholesky")
-    assert split.memory("cholesky") == 4.5 * alone.memory("cholesky")  # measured, of the set-up
+    assert split.memory("cholesky") == 2.1 * alone.memory("cholesky")  # measured, of the set-up
     assert split.solve("cholesky") / alone.solve("cholesky") == pytest.approx(0.61, abs=0.05)  # measured
     assert replace(split, n=5_000).repeated("cholesky")
     assert replace(split, dimension=3).repeated("cholesky")
