@@ -35,6 +35,7 @@ from softgrasp.fem.mesh.check import (
     sort_facets,
 )
 from softgrasp.fem.mesh.foreign import read_foreign
+from softgrasp.fem.mesh.text import read_text
 from softgrasp.fem.mesh.tissue_mesh import MeshArrays, Sets, TissueMesh, inspected, spread
 
 
@@ -169,7 +170,7 @@ def _read(path: Path, limit: float | None) -> meshio.Mesh:
         if not path.is_file():
             given = " ('given' is a mesh that a program passes to softgrasp.build)" if path.name == "given" else ""
             raise MeshError(f"The mesh file {path} does not exist: tissue.mesh is relative to the scene file{given}.")
-        return read_foreign(path, limit)
+        return read_text(path) or read_foreign(path, limit)
     except TimeoutError as error:
         raise MeshError(
             f"meshio did not end within {error} s of processor time on {path}, as on damaged files: export it again, "
@@ -218,34 +219,46 @@ def _marked(
     values: list[int] = []
     if tag_name is not None:
         # Numbers of any size, signed or not, by their place among all: one array of both kinds would be of floats.
-        parts = [np.asarray(raw.cell_data[tag_name][i]) for i, *_ in blocks]
-        values = sorted({value for part in parts for value in np.unique(part).tolist()})
+        parts = [_numbered(np.asarray(raw.cell_data[tag_name][i])) for i, *_ in blocks]
+        values = sorted({value for own, _ in parts for value in own})
         place = {value: k for k, value in enumerate(values)}
-        tags = np.concatenate([_placed(part, place)[p] for part, (_, p) in zip(parts, cut, strict=True)])
+        of = [np.array([place[value] for value in own])[k] for own, k in parts]
+        tags = np.concatenate([each[p] for each, (_, p) in zip(of, cut, strict=True)])
     named = _named(raw, blocks, cut)
     if tag_name is None and not named:
         return nodes, None, {}
     marks = tags
     for member in named.values():
-        mixed = np.intersect1d(marks[member], marks[~member])
-        if mixed.size:
-            _, marks = np.unique(2 * marks + (member & np.isin(marks, mixed)), return_inverse=True)
+        count = int(marks.max()) + 1
+        inside = np.bincount(marks[member], minlength=count)
+        mixed = (inside > 0) & (inside < np.bincount(marks, minlength=count))
+        if mixed.any():
+            marks = _numbered(2 * marks + (member & mixed[marks]))[1]
     sets: Sets = {}
     if tag_name is not None:
-        for tag, mark in np.unique(np.stack([tags, marks]), axis=1).T.tolist():
+        count = int(marks.max()) + 1
+        for pair in _numbered(tags * count + marks)[0]:
+            tag, mark = divmod(pair, count)
             sets[values[tag]] = (*sets.get(values[tag], ()), mark)
     for name, number in _physical_names(raw, dimension).items():
         if tag_name == "gmsh:physical" and number in sets:
             sets[name] = sets[number]
     for name, member in named.items():
-        sets[name] = tuple(np.unique(marks[member]).tolist())
+        sets[name] = tuple(np.flatnonzero(np.bincount(marks[member])).tolist())
     return nodes, marks.astype(np.int32), sets
 
 
-def _placed(part: npt.NDArray[np.integer], place: dict[int, int]) -> Integers:
-    """The place of each number of an array."""
-    values, inverse = np.unique(part, return_inverse=True)
-    return np.array([place[value] for value in values.tolist()], dtype=np.int64)[inverse]
+def _numbered(numbers: npt.NDArray[np.integer]) -> tuple[list[int], Integers]:
+    """The values that occur, ascending, and the place of each number among them: few and close ones are not sorted."""
+    low, high = int(numbers.min()), int(numbers.max())
+    if low == high:
+        return [low], np.zeros(len(numbers), dtype=np.int64)
+    if high - low > len(numbers):
+        values, places = np.unique(numbers, return_inverse=True)
+        return values.tolist(), places
+    above = ((numbers if numbers.itemsize == 8 else numbers.astype(np.int64)) - low).astype(np.int64)
+    occurs = np.bincount(above) > 0
+    return [low + k for k in np.flatnonzero(occurs).tolist()], (np.cumsum(occurs) - 1)[above]
 
 
 def _named(
@@ -257,7 +270,7 @@ def _named(
     """
     holds = {}
     for name, lists in raw.cell_sets.items():
-        if name.startswith("gmsh:"):  # numbers of CAD entities, not of cells
+        if name is None or name.startswith("gmsh:"):  # without a name, or numbers of CAD entities, not of cells
             continue
         if len(lists) != len(raw.cells) or not all(_is_cell_list(part) for part in lists):
             continue
