@@ -12,13 +12,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise, permutations, product
+from itertools import pairwise, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgrasp.fem.compiled import functions, packed
+from softgrasp.fem.mesh.cells import simplices
 from softgrasp.fem.mesh.check import (
     MOST_PAIRS,
     SEAM,
@@ -151,19 +152,15 @@ def _buried(lines: list[Floats], full: Flags, places: Floats) -> Flags:
 
 def _cut(lines: list[Floats], fill: Floats, full: Flags) -> tuple[Floats, Integers, Ints]:
     """Corners, simplices of positive volume, and their marks, of the full lattice cells."""
-    d = len(lines)
-    lowest, shape = np.argwhere(full), [len(each) for each in lines]
-    cells = []
-    for order in permutations(range(d)):
-        path = np.cumsum(np.vstack([np.zeros((1, d), dtype=int), np.eye(d, dtype=int)[list(order)]]), axis=0)
-        odd = np.linalg.det(np.diff(path, axis=0)) < 0
-        path[[-2, -1]] = path[[-1, -2]] if odd else path[[-2, -1]]
-        cells.append(np.stack([np.ravel_multi_index(tuple((lowest + step).T), shape) for step in path], axis=1))
-    marks = np.tile(fill[full].argmax(axis=1), math.factorial(d)).astype(np.int32)
-    used, numbers = np.unique(np.concatenate(cells), return_inverse=True)
+    square, shape = [(0, 0), (1, 0), (1, 1), (0, 1)], [len(each) for each in lines]
+    steps = np.array(square if len(lines) == 2 else [(*step, z) for z in (0, 1) for step in square])
+    boxes = np.ravel_multi_index(tuple(np.moveaxis(np.argwhere(full)[:, None] + steps, -1, 0)), shape)
+    cells, parents = simplices(boxes, "quad" if len(lines) == 2 else "hexahedron")
+    marks = fill[full].argmax(axis=1)[parents].astype(np.int32)
+    used, numbers = np.unique(cells, return_inverse=True)
     places = np.unravel_index(used, shape)
     corners = np.stack([each[place] for each, place in zip(lines, places, strict=True)], axis=1)
-    return corners, numbers.reshape(-1, d + 1).astype(np.int64), marks
+    return corners, numbers.reshape(cells.shape), marks
 
 
 def _nearest(points: Floats, places: Floats) -> Integers:

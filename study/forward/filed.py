@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -17,8 +16,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.model.contact import BOX_TOLERANCE
 from softgrasp.fem.model.memory import check_memory
 from softgrasp.fem.scene.scene import Contact, check_dimension
-from softgrasp.study.forward.copies import MOST_LOOKED_AT, NOT_ASSEMBLED, Copy, node_pairs_of, planned
-from softgrasp.study.forward.result import model_sizes
+from softgrasp.study.forward.copies import MOST_LOOKED_AT, NOT_ASSEMBLED, Copy, computed, node_pairs_of, planned
 from softgrasp.study.report import percent
 
 if TYPE_CHECKING:  # meshio is not imported where no file is read
@@ -29,43 +27,37 @@ CELLS = {2: 1000, 3: 250}  # lattice cells of a copy, about
 LIKE = 0.05, 0.15, 0.3, 0.02  # most that volume, surface and contact zone of a copy may differ, and be buried [1]
 
 
-@dataclass(frozen=True)
-class Outline:
-    """What a mesh file and its copy have in common."""
+class Outline(NamedTuple):
+    """What the sizes of a mesh file follow from, and how its copy differs."""
 
     counts: tuple[int, ...]  # simplices of the file by dimension, by Euler's formula for a body without holes
     held: int  # vertices of the file in the contact zone
     finer: float  # edges of the cells of the file over those of the copy [1]
-    volume: float  # of the copy over that of the file, less 1 [1]
-    surface: float  # likewise [1]
-
-    def text(self, n_e: int) -> str:
-        """Whose modes and sag are told, and how exact sizes and copy are."""
-        return (
-            f"{NOT_ASSEMBLED}a coarser copy of the body with quadratic elements, n_e = {n_e}, whose volume differs by "
-            f"{percent(abs(self.volume))} and surface by {percent(abs(self.surface))}. Sizes with about are computed, "
-            "to 1 % of the unknowns and 10 % of the non-zeros. Singular ends and faults of the file are not looked for."
-        )
+    differs: str  # by how much, in words
 
 
 def file_copy(scene: Scene, comm: MPI.Intracomm) -> tuple[Copy | None, TissueMesh | None]:
     """Of a large mesh file, a lattice with quadratic elements; else None, and the mesh, if it was read. Collective.
 
+    A body to be repaired is mended first. Meshes are assembled where singular ends give the cells ([tissue.refine]), as
+    those of lattice cells are not those of the body, and where a plan asks for the nodes themselves.
+
     None too where volume, surface or contact zone of the copy differ by more than `LIKE`, where it closes a slit, or
     misses a layer.
     """
     tissue = scene.tissue
-    if not tissue.mesh or scene._given is not None or tissue.refine is not None or tissue.repair or planned(scene):
+    if not tissue.mesh or scene._given is not None or tissue.refine is not None or planned(scene):
         return None, None
-    from softgrasp.fem.mesh.file import checked, load_body  # meshio is needed for mesh files only
+    from softgrasp.fem.mesh.file import checked, load_body, mended  # meshio is needed for mesh files only
 
     body = arrays = outline = None
     with raise_on_all_ranks(comm):
         if comm.rank == 0:
             body = load_body(scene.directory / str(tissue.mesh), tissue.scale, tissue.read_limit)
             if _large(body, tissue.order):
+                body = mended(body, tissue.seam)[0] if tissue.repair else body
                 arrays, outline = _lattice(scene, body)
-            arrays = arrays or checked(body, False, tissue.seam)
+            arrays = arrays or checked(body, tissue.repair, tissue.seam)
     mesh, outline = spread(comm, arrays), comm.bcast(outline)
     scene._mesh_digest = mesh.digest
     if outline is None:
@@ -77,16 +69,17 @@ def file_copy(scene: Scene, comm: MPI.Intracomm) -> tuple[Copy | None, TissueMes
         model = build(coarse, comm=comm, mesh=mesh, run=False)
     except (MeshError, SceneError):  # it misses a layer, or a part of it is not held
         with raise_on_all_ranks(comm):
-            arrays = None if body is None else checked(body, False, tissue.seam)
+            arrays = None if body is None else checked(body, tissue.repair, tissue.seam)
         return None, spread(comm, arrays)
-    small, (nodes, pairs) = model_sizes(model), node_pairs_of(outline.counts, tissue.order)
-    free = 1 - outline.held * tissue.order ** (d - 1) / nodes
-    n_e = int(float(f"{d * nodes * free:.2e}"))
-    sizes = replace(
-        small, n_e=n_e, states=2 * (small.n_s + n_e), cells=outline.counts[-1], nodes=nodes,
-        nonzeros=int(float(f"{d**2 * pairs * free:.1e}")),
-    )  # fmt: skip
-    return Copy(model, sizes, outline.text(small.n_e), outline.finer, alike=False), mesh
+    nodes, _ = node_pairs_of(outline.counts, tissue.order)
+    n_e = int(float(f"{d * (nodes - outline.held * tissue.order ** (d - 1)):.2e}"))
+    sizes = computed(model, tissue.order, outline.counts, n_e)
+    text = (
+        f"{NOT_ASSEMBLED}a coarser copy of the body with quadratic elements, n_e = {model.system.layout.n_e}, "
+        f"{outline.differs}. Sizes with about are computed, to 1 % of the unknowns and 10 % of the non-zeros. Singular "
+        "ends and faults of the file are not looked for."
+    )
+    return Copy(model, sizes, text, outline.finer, alike=False), mesh
 
 
 def _large(body: Body, order: int) -> bool:
@@ -124,7 +117,9 @@ def _lattice(scene: Scene, body: Body) -> tuple[MeshArrays, Outline] | tuple[Non
     vertices, cells, skin = len(body.points), len(body.cells), int(copy.ends.sum())
     facets_of = ((d + 1) * cells + (skin if d == 2 else 2 * skin - 4)) // 2
     counts = (vertices, facets_of, cells) if d == 2 else (vertices, vertices + facets_of - cells - 1, facets_of, cells)
-    return copy.arrays, Outline(counts, int(on.sum()), copy.finer, copy.volume, copy.surface)
+    volume, surface = (percent(abs(share)) for share in (copy.volume, copy.surface))
+    differs = f"whose volume differs by {volume} and surface by {surface}"
+    return copy.arrays, Outline(counts, int(on.sum()), copy.finer, differs)
 
 
 def _in_zone(places: Floats, low: Floats, high: Floats, contact: Contact) -> Flags:
