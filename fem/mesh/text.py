@@ -23,7 +23,7 @@ from softgrasp.fem.compiled import functions, packed
 from softgrasp.fem.mesh.check import Integers
 
 SECTIONS = ("MeshFormat", "PhysicalNames", "Entities", "Nodes", "Elements")  # of Gmsh, in this order
-SPARSE = 10  # largest number of a node or cell over how many there are, beyond which a table of all is too long [1]
+SPARSE = 10  # span of the numbers of nodes or cells over how many there are, beyond which a table is too long [1]
 _BEGIN, _END = re.compile(rb"\s*\$(\w+)[ \t\r]*\n"), re.compile(rb"[ \t\r]*(?:\n\s*|\Z)")
 
 type Numbers = npt.NDArray[Any]
@@ -91,20 +91,25 @@ class _Reader:
         return values[:found], values[:0] if lines is None else lines[: asked.contents[1]]
 
 
-def _places(numbers: Numbers, kind: Any) -> Numbers:
-    """The place of each number of a node or cell, -1 where there is none, the last where there are several."""
-    if not len(numbers) or numbers.min() < 1 or numbers.max() > SPARSE * len(numbers):
-        raise _UnusualError
-    places = np.full(int(numbers.max()) + 1, -1, dtype=kind)
-    places[numbers] = np.arange(len(numbers))
-    return places
+class _Places:
+    """The place of each number of a node or cell, the last one where there are several."""
 
+    def __init__(self, numbers: Numbers, kind: Any) -> None:
+        if not len(numbers) or numbers.min() < 1 or np.ptp(numbers) > SPARSE * len(numbers):
+            raise _UnusualError
+        self.low = numbers.min()
+        self.places = np.full(int(numbers.max() - self.low) + 1, -1, dtype=kind)
+        self.places[numbers - self.low] = np.arange(len(numbers))
 
-def _placed(places: Numbers, numbers: Numbers) -> Numbers:
-    """Places of the nodes of cells."""
-    if numbers.min(initial=len(places)) < 1 or numbers.max(initial=0) >= len(places):
-        raise _UnusualError
-    return np.asarray(places[numbers])
+    def of(self, numbers: Numbers) -> Numbers:
+        """The places of numbers that lie between the least and the largest, -1 of those that are none."""
+        if not self.among(numbers).all():
+            raise _UnusualError
+        return np.asarray(self.places[numbers - self.low])
+
+    def among(self, numbers: Numbers) -> Numbers:
+        """Whether numbers lie between the least and the largest."""
+        return np.asarray((numbers >= self.low) & (numbers < self.low + len(self.places)))
 
 
 def _sections(text: Text) -> tuple[dict[str, tuple[int, int]], dict[str, Integers]]:
@@ -146,7 +151,7 @@ def _gmsh_2(text: Text) -> meshio.Mesh:
     parts, names = _sections(text)
     count, reader = _counted(text, parts["Nodes"])
     nodes = reader.take(4 * count, whole=False).reshape(-1, 4)
-    places = _places(nodes[:, 0].astype(np.int32), np.int32)
+    places = _Places(nodes[:, 0].astype(np.int32), np.int32)
     count, reader = _counted(text, parts["Elements"])
     values, lengths = reader.lines()
     if not len(lengths) == count or lengths.min() < 5:
@@ -160,7 +165,7 @@ def _gmsh_2(text: Text) -> meshio.Mesh:
         corners = num_nodes_per_cell[kind]
         if (lengths[a:b] != 3 + tags + corners).any() or (table[:, 2] != tags).any() or tags < 2:
             raise _UnusualError
-        cells.append((kind, _placed(places, _gmsh_to_meshio_order(kind, table[:, -corners:]))))
+        cells.append((kind, places.of(_gmsh_to_meshio_order(kind, table[:, -corners:]))))
         physical.append(table[:, 3])
         geometrical.append(table[:, 4])
     data = {"gmsh:physical": physical, "gmsh:geometrical": geometrical}
@@ -182,7 +187,7 @@ def _gmsh_4(text: Text) -> meshio.Mesh:
         dimension, tag, code, count = reader.take(4).tolist()
         kind = _gmsh_to_meshio_type[code]
         table = reader.take(count * (1 + num_nodes_per_cell[kind])).reshape(count, -1)
-        cells.append((kind, _placed(places, _gmsh_to_meshio_order(kind, table[:, 1:]))))
+        cells.append((kind, places.of(_gmsh_to_meshio_order(kind, table[:, 1:]))))
         own = [] if groups is None else groups[dimension][tag]
         physical += [np.broadcast_to(own[0], count)] if own else []
         geometrical.append(np.broadcast_to(tag, count))
@@ -206,7 +211,7 @@ def _physical(reader: _Reader) -> list[dict[int, list[int]]]:
     return groups
 
 
-def _nodes_4(reader: _Reader) -> tuple[Numbers, Numbers]:
+def _nodes_4(reader: _Reader) -> tuple[Numbers, _Places]:
     """Coordinates of the nodes, and the place of each node number."""
     blocks, total = reader.take(4)[:2].tolist()
     numbers, points = [], []
@@ -216,7 +221,7 @@ def _nodes_4(reader: _Reader) -> tuple[Numbers, Numbers]:
             raise _UnusualError
         numbers.append(reader.take(count))
         points.append(reader.take(3 * count, whole=False).reshape(-1, 3))
-    places = _places(np.concatenate(numbers), np.int64)
+    places = _Places(np.concatenate(numbers), np.int64)
     if sum(map(len, points)) != total:
         raise _UnusualError
     return np.concatenate(points), places
@@ -253,9 +258,10 @@ class _Abaqus:
 
     def __init__(self, text: Text) -> None:
         self.text = text
-        self.points = self.places = np.zeros(0)
+        self.points = np.zeros(0)
+        self.places = _Places(np.ones(1, dtype=np.int32), np.int64)
         self.cells: list[tuple[str, Numbers]] = []
-        self.numbers: list[Numbers] = []  # place of each cell number, by block
+        self.numbers: list[_Places] = []  # place of each cell number, by block
         self.sets: dict[str, list[Any]] = {}
         self.named: dict[str, Numbers] = {}  # all cells of a block with a name
         self.order: list[str] = []  # of these names
@@ -267,7 +273,7 @@ class _Abaqus:
         rows = values.reshape(len(lengths), -1)
         if (lengths != rows.shape[1]).any():
             raise _UnusualError
-        self.points, self.places = rows[:, 1:], _places(rows[:, 0].astype(np.int64), np.int64)
+        self.points, self.places = rows[:, 1:], _Places(rows[:, 0].astype(np.int64), np.int64)
 
     def elements(self, part: tuple[int, int], options: dict[str, str]) -> None:
         """Rows (number, nodes), which may go on in the next line."""
@@ -277,10 +283,10 @@ class _Abaqus:
         kind = abaqus_to_meshio_type[options["TYPE"]]
         values, _ = _Reader(self.text, *part, commas=True).lines()
         rows = values.reshape(-1, 1 + num_nodes_per_cell[kind])
-        cells = _placed(self.places, rows[:, 1:])
+        cells = self.places.of(rows[:, 1:])
         if cells.min() < 0:
             raise _UnusualError
-        self.numbers.append(_places(rows[:, 0], np.int32))
+        self.numbers.append(_Places(rows[:, 0], np.int32))
         self.cells.append((kind, cells))
         if "ELSET" in options:
             self.named[options["ELSET"]] = np.arange(len(cells), dtype=np.int32)
@@ -300,10 +306,10 @@ class _Abaqus:
         else:
             ids, names, _ = _read_set(io.StringIO(text.decode()), options)
         if keyword == "NSET":
-            if len(ids) and _placed(self.places, ids).min() < 0:
+            if len(ids) and self.places.of(ids).min() < 0:
                 raise _UnusualError
             return
-        parts = [places[ids[ids < len(places)]] for places in self.numbers] if len(ids) else []
+        parts = [places.of(ids[places.among(ids)]) for places in self.numbers] if len(ids) else []
         found: list[Any] = [each[each >= 0] for each in parts]
         if not len(ids):
             found = [self.sets[name] if name in self.sets else self.named[name] for name in names]

@@ -52,6 +52,8 @@ def build_seconds(scene: Scene) -> float:
     if not tissue.cells or scene._given is not None or planned(scene):
         return 0.0
     d = len(tissue.cells)
+    if d * _lattice(scene) <= MOST_LOOKED_AT[d]:  # its copy would be itself
+        return 0.0
     if refine is not None and not (by_lines(scene) and refine.tolerance is None and d * _lattice(scene) <= refine.most):
         return 0.0
     return BUILD[d, tissue.order] * box_simplices(tissue.cells)

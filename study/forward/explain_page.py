@@ -45,8 +45,9 @@ def sections(result: Explanation) -> list[Section]:
     """The parts of the page."""
     s, t, solver = result.sizes, result.time, result.solver
     about, near = "" if result.counted else "about ", "" if result.built else "about "
+    states = s.states if result.counted else int(float(f"{s.states:.2e}"))
     sizes = [
-        ("hand, tissue unknowns, states", f"n_s = {s.n_s}, n_e = {about}{s.n_e}, 2n = {about}{s.states}"),
+        ("hand, tissue unknowns, states", f"n_s = {s.n_s}, n_e = {about}{s.n_e}, 2n = {about}{states}"),
         ("cells, nodes, non-zeros of K_ee", f"{s.cells}, {s.nodes}, {near}{s.nonzeros}"),
         *((f"output {name}", place) for name, place in result.outputs.items()),
         ("Poisson's ratio", ", ".join(f"{nu:.4g} ({name})" for name, nu in result.poisson.items())),
@@ -123,7 +124,7 @@ def sag_rows(result: Explanation) -> list[tuple[str, str]]:
     sag, assumed = result.sag, "" if result.effects["gravity"].on else " (assumed: gravity is off)"
     steep = sag.gradient
     return [
-        ("g", "(" + ", ".join(f"{x:g}" for x in sag.g) + f") m/s2{assumed}"),
+        ("g", "(" + ", ".join(f"{x + 0.0:g}" for x in sag.g) + f") m/s2{assumed}"),
         ("largest |z|", f"{sag.largest:.4g} m"),
         ("|grad z|", f"{steep.largest:.3g} at most, above {steep.typical:.3g} in {percent(SMALL_SHARE)} of the body"),
         ("linear elasticity", f"{'valid' if steep.linear else 'not valid'}: |grad z| is above {SMALL_STRAIN} in "

@@ -352,3 +352,4 @@ def test_scenes_that_need_their_own_mesh_are_built() -> None:
     assert build_seconds(load_scene("paper_forward", [cells, "tissue.refine={most=700000,tolerance=0.01}"])) == 0
     assert build_seconds(load_scene("paper_forward", [cells, "tissue.refine={most=700000,method='bisect'}"])) == 0
     assert build_seconds(load_scene("paper_obstacle", [cells])) == 0
+    assert build_seconds(load_scene("set_down_3d")) == 0  # its copy would have the same cells
