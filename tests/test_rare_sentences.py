@@ -177,7 +177,7 @@ def nothing_converges(_: Path, patch: pytest.MonkeyPatch) -> None:
 
 
 def no_contact_model(_: Path, patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(contact, "_choices", lambda _, refused: refused.update(nodes="no force at rest") or ())
+    patch.setattr(contact, "_models", lambda _, refused, __: refused.update(nodes="no force at rest") or {})
     full: Any = SimpleNamespace(model=SimpleNamespace(system=SimpleNamespace(layout=SimpleNamespace(comm=None))))
     contact.measure_contact(full, None, lambda *_: None)  # type: ignore[arg-type]
 

@@ -1,7 +1,8 @@
 """Making of reduced models with contact: V = [K^-1 G, modes, K^-1 N', S^-1 N'm], orthonormal in the mass [CB68].
 
 On fine meshes rows of hat functions h_j over several nodes replace those of nodes: mean gaps are >= 0. The last
-columns, S = K + s D + s^2 M at frequencies above the modes, answer the impulse m that stops a face landing at once.
+columns, S = K + s D + s^2 M, answer the impulse m that stops a face landing at once. A model of N columns is the part
+of a rich one of this kind that a few motions need, see `train.py`.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import make_solver
 from softgrasp.fem.solve.stiffness import static_columns, static_solver
 from softgrasp.fem.system import BlockSystem, dynamic_stiffness
+from softgrasp.reduction.contact.hats import foremost, hat_functions
 from softgrasp.reduction.contact.model import ContactModel, Ints, plane
+from softgrasp.reduction.contact.train import Training, train
 from softgrasp.reduction.origin import origin_of
 from softgrasp.reduction.system import ModelError
 
@@ -31,16 +34,17 @@ if TYPE_CHECKING:
 
 PREFIX = "softgrasp_landing_"
 DEPENDENT = 1e-13  # least share of a direction of the basis in its Gram matrix, scaled [1]
-# s of the answers to a landing over the frequency of the highest mode, and EACH: chosen with the errors on set_down and
-# the paper's block in sight, also those of the motions that docs/guide calls held out [1].
-LANDING = 8.0, 250.0
+# s of the answers to a landing over 2 / dt, and EACH: chosen with the errors on set_down and the paper's block in
+# sight, also those of the motions that docs/guide calls held out [1].
+LANDING = 0.15, 4.5
 EACH = 6  # modes per such answer, of which the second helps the force and the mode in its place the deformation
-# Power of the distance from the end by which hat functions crowd there, where pressures are steep; chosen on the
-# motions whose errors docs/guide gives [1].
-CROWD = 1.6
+RICH = 60  # modes of a rich model
+RICH_LANDING = 0.01, 0.05, 0.2, 0.8, 3.5, 15.0  # s of its answers to a landing over 2 / dt, from slow to instant [1]
 
 
-def contact_model(model: Model, modes: int = 10, reach: float | None = None, rows: int | None = None) -> ContactModel:
+def contact_model(
+    model: Model, modes: int = 10, reach: float | None = None, rows: int | None = None, N: int | None = None
+) -> ContactModel:
     """The tissue in coordinates z = V a, V = [K^-1 G, modes, K^-1 N', S^-1 N'm] orthonormal in M [CB68]. Collective.
 
     Args:
@@ -52,9 +56,13 @@ def contact_model(model: Model, modes: int = 10, reach: float | None = None, row
             enters an obstacle is refused.
         rows: number of hat functions along each half-space in 2D, at least 2, whose mean gaps are >= 0, for N that does
             not grow with the mesh; None: a row for each node. Of nodes behind each other the foremost is in them.
+        N: number of columns in all, at most; it replaces ``modes`` and ``rows``. The columns beside the responses, and
+            in 2D the number of rows, are those that a rich model needs on the motion of the scene and on others like
+            it, which takes longer. None: no training.
 
     Raises:
-        ModelError: the scene has other obstacles, no contact or a two-way hand, or no node comes within reach.
+        ModelError: the scene has other obstacles, no contact or a two-way hand, or no node comes within reach, or N is
+            given with ``rows`` or has too little room.
 
     >>> import softgrasp as sg
     >>> rom = sg.contact_model(sg.build("set_down", ["tissue.cells=[6, 4]"]), modes=8)
@@ -62,6 +70,22 @@ def contact_model(model: Model, modes: int = 10, reach: float | None = None, row
     >>> rom.N, bool(run.gap.min() > -1e-12)
     (17, True)
     """
+    if N is None:
+        return _assembled(model, modes, reach, rows)
+    if rows is not None:
+        raise ModelError("rows cannot go with N, which chooses them; give one of both")
+    return trained(model, reach).model(N)
+
+
+def trained(model: Model, reach: float | None = None) -> Training:
+    """What models of any N are taken from, see :func:`contact_model`. Collective."""
+    return train(_assembled(model, min(RICH, model.system.layout.n_e), reach, rich=True))
+
+
+def _assembled(
+    model: Model, modes: int, reach: float | None, rows: int | None = None, rich: bool = False
+) -> ContactModel:
+    """A model of given modes and rows; a rich one has the nodes of a face and more answers to a landing. Collective."""
     scene, system = model.scene, model.system
     layout, obstacles = system.layout, check_contact_scene(model)
     seconds, begin = {}, time.perf_counter()
@@ -74,17 +98,10 @@ def contact_model(model: Model, modes: int = 10, reach: float | None = None, row
     kept = np.flatnonzero(nearest_gaps(surface, obstacles, table.q, dt, len(table.q)).min(axis=0) < near)
     if not len(kept):
         raise ModelError(f"no boundary node comes within reach = {near:.3g} m of an obstacle; give a larger reach")
-    if rows is not None:  # a hat goes along one face: of what lies above another node none
-        kept = _foremost(surface.X, kept, obstacles, near)
-    hats = tuple(_hats(surface, kept, o, rows) for o in obstacles)
-    loads = _responses(model, surface, kept, obstacles, hats)
-    normals = np.unique([plane(o)[0] for o in obstacles], axis=0)
-    answers = LANDING[: max(1, modes // (EACH * len(normals)))]
-    squares, shapes = lowest_modes(system, max(1, modes - len(answers) * len(normals)))
-    blocks = [static_columns(system, np.asfortranarray(np.hstack([system.G, loads]))), shapes]
-    highest = float(np.sqrt(squares[-1]))
-    blocks += [_landing(system, surface, kept, normals, ratio * highest) for ratio in answers]
-    V, stiffness = _diagonal(model, np.hstack(blocks))
+    if rows is not None or rich:  # a hat goes along one face: of what lies above another node none
+        kept = foremost(surface.X, kept, obstacles, near)
+    hats = tuple(hat_functions(surface.X, kept, o, rows) for o in obstacles)
+    V, stiffness = _diagonal(model, _columns(model, surface, kept, obstacles, hats, modes, rich))
     seconds["basis"] = time.perf_counter() - begin
     begin = time.perf_counter()
     viscous = viscosity(system, 1.0)
@@ -119,46 +136,21 @@ def check_contact_scene(model: Model) -> tuple[Obstacle, ...]:
     return obstacles
 
 
-def reachable(model: Model) -> tuple[int, int]:
-    """Boundary nodes within the reach of :func:`contact_model`, and different normals of half-spaces. Collective."""
-    scene, layout = model.scene, model.system.layout
-    obstacles = check_contact_scene(model)
-    table, dt = motion_table(scene, layout.n_s), scene.time_end / scene.time.steps
-    surface = make_surface(model.space, model.system)
-    least = nearest_gaps(surface, obstacles, table.q, dt, len(table.q)).min(axis=0)
-    normals = {tuple(plane(o)[0].tolist()) for o in obstacles}
-    return int((least < node_distance(model.space) / 2).sum()), len(normals)
-
-
-def _foremost(X: Array, kept: Ints, obstacles: tuple[Obstacle, ...], distance: float) -> Ints:
-    """The kept nodes with no other one straight before them at rest, towards the obstacle that is nearest to them."""
-    gaps = np.array([o.gap(X[kept]) for o in obstacles])
-    first = np.ones(len(kept), dtype=bool)
-    for j, o in enumerate(obstacles):
-        n, mine = plane(o)[0], gaps.argmin(axis=0) == j
-        beside = X[kept] - gaps[j][:, None] * n
-        before = gaps[j][None, :] < gaps[j][:, None] - distance
-        close = np.linalg.norm(beside[:, None] - beside[None], axis=2) < distance
-        first &= ~(mine & (before & close).any(axis=1))
-    return kept[first]
-
-
-def _hats(surface: Surface, kept: Ints, obstacle: Obstacle, rows: int | None) -> Array:
-    """Shares of the kept nodes in the rows of a half-space, (rows, nodes) [1].
-
-    Raises ModelError: rows is less than 2, or the tissue is 3D.
-    """
-    if rows is None:
-        return np.eye(len(kept))
-    if surface.X.shape[1] == 3 or rows < 2:
-        raise ModelError(f"rows = {rows}; it must be at least 2, and in 3D every node has a row: leave it out")
-    n = plane(obstacle)[0]
-    x = surface.X[kept] @ np.array([-n[1], n[0]])
-    s = np.linspace(-1.0, 1.0, rows)
-    even = (1 + np.sign(s) * (1 - (1 - np.abs(s)) ** CROWD)) / 2
-    at = np.unique(x[np.abs(x[:, None] - (x.min() + np.ptp(x) * even)).argmin(axis=0)])  # where nodes are
-    H = np.array([np.interp(x, at, unit) for unit in np.eye(len(at))])
-    return np.asarray(H / H.sum(axis=1, keepdims=True))
+def _columns(
+    model: Model, surface: Surface, kept: Ints, obstacles: tuple[Obstacle, ...], hats: tuple[Array, ...], modes: int,
+    rich: bool,
+) -> Array:  # fmt: skip
+    """K^-1 G, K^-1 N', modes and answers to a landing, local rows (n_local, columns). Collective."""
+    system = model.system
+    loads = _responses(model, surface, kept, obstacles, hats)
+    normals = np.unique([plane(o)[0] for o in obstacles], axis=0)
+    answers = RICH_LANDING if rich else LANDING[: max(1, modes // (EACH * len(normals)))]
+    shapes = lowest_modes(system, max(1, modes - len(answers) * len(normals)))[1]
+    fast = 2 * model.scene.time.steps / model.scene.time_end
+    return np.hstack([
+        static_columns(system, np.asfortranarray(np.hstack([system.G, loads]))), shapes,
+        *(_landing(system, surface, kept, normals, s * fast) for s in answers),
+    ])  # fmt: skip
 
 
 def _responses(

@@ -9,19 +9,17 @@ from functools import partial
 import numpy as np
 
 from softgrasp.fem import Model, SolverError, simulate
-from softgrasp.fem.petsc import Array
 from softgrasp.reduction import FullRun, ModelError, ReductionError, full_run
-from softgrasp.reduction.contact.make import check_contact_scene, contact_model, reachable
+from softgrasp.reduction.contact.make import check_contact_scene, trained
 from softgrasp.reduction.contact.model import ContactModel, ContactRun, plane
 from softgrasp.reduction.contact.replay import errors_contact, replay_contact
+from softgrasp.reduction.contact.train import directions, tangent
 from softgrasp.reduction.parameters import moved_to
 from softgrasp.study.reduce.times import FullTimes, Say
 from softgrasp.study.shell import median_processor_seconds
 
-MODES = (20, 14, 5)  # clamped modes beside the responses unless the scene names N
-HATS = 14  # rows of hat functions along a half-space then
-LEAST = 4  # modes for which a given N must have room beside rows of all nodes, where there are no hat functions
-SHARE = 0.5  # of a given N without the hand's columns that rows take: hat functions, where those of nodes take more
+NUMBERS = (38, 30, 22)  # columns in 2D unless the scene names N
+BESIDE = (20, 14, 5)  # columns in 3D beside those of the hand and of all nodes within reach then
 RUNS = 9  # behind each median of the time of a run
 DEEP, DEEPER = 1.05, 1.15  # ways of held-out motions towards the first obstacle, over that of the scene
 ASIDE = 0.5  # way along it over that towards it, where the motion of the scene has none
@@ -81,11 +79,7 @@ def measure_contact(full: FullRun, times: FullTimes, say: Say) -> ContactStudy:
     """Make the models and run them. Collective. Raises SoftgraspError: no model fits, or a full run failed."""
     model, refused = full.model, dict[str, str]()
     comm = model.system.layout.comm
-    models, choices = dict[str, ContactModel](), list(_choices(model, refused))
-    for i, (rows, modes) in enumerate(choices):
-        say("reduced model", i, len(choices))
-        rom = contact_model(model, modes, rows=rows)
-        models.setdefault(f"{'nodes' if rows is None else 'hats'}_{rom.N}", rom)
+    models = _models(model, refused, say)
     own: dict[str, tuple[float, float | None]] = {}
     depth, seconds, runs = dict[str, float](), dict[str, float](), dict[str, ContactRun]()
     for key, rom in list(models.items()):
@@ -156,33 +150,29 @@ def _try_motion(
     return other, motion, answers
 
 
-def _choices(model: Model, refused: dict[str, str]) -> Iterator[tuple[int | None, int]]:
-    """Rows, None for those of nodes, and modes of each model. Raises ReductionError: no given N is possible."""
-    options, layout = model.scene.reduction, model.system.layout
-    nodes, directions = reachable(model)
-    if "N" not in options.model_fields_set:
-        yield from ((None, modes) for modes in MODES)
-        if layout.dimension == 2 and nodes > HATS:
-            yield from ((HATS, modes) for modes in MODES)
-        return
-    some = False
-    for N in sorted(set(options.N), reverse=True):
-        free = N - layout.n_s
-        rows = round(SHARE * free / directions)
-        hats = layout.dimension == 2 and rows >= 2
-        if free >= directions * nodes + LEAST and not (hats and rows < nodes):
-            some = True
-            yield None, free - directions * nodes
-        elif hats:
-            some = True
-            yield rows, free - directions * rows
-        else:
-            refused[f"N = {N}"] = (
-                f"the hand has {layout.n_s} columns and {nodes} nodes within reach {directions * nodes}, and {LEAST} "
-                "modes are the least beside them"
-            )
-    if not some:
+def _models(model: Model, refused: dict[str, str], say: Say) -> dict[str, ContactModel]:
+    """Models by rows and dimension. Collective. Raises ReductionError: no given N is possible."""
+    options, models = model.scene.reduction, dict[str, ContactModel]()
+    say("reduced model", 0, 1)
+    training = trained(model)
+    nodes, hand = len(training.rich.kept), training.rich.G.shape[1]
+    if "N" in options.model_fields_set:
+        numbers = sorted(set(options.N), reverse=True)
+    elif model.system.layout.dimension == 2:
+        numbers = list(NUMBERS)
+    else:
+        numbers = [hand + directions(training.rich.obstacles) * nodes + more for more in BESIDE]
+    for i, N in enumerate(numbers):
+        say("reduced model", i, len(numbers))
+        try:
+            rom = training.model(N)
+        except ModelError as error:
+            refused[f"N = {N}"] = str(error)
+            continue
+        models.setdefault(f"{'nodes' if len(rom.hats[0]) == nodes else 'hats'}_{rom.N}", rom)
+    if not models:
         raise ReductionError(f"reduction.N has no possible dimension: {next(iter(refused.values()))}")
+    return models
 
 
 def _others(model: Model) -> Iterator[tuple[str, list[float]]]:
@@ -195,17 +185,10 @@ def _others(model: Model) -> Iterator[tuple[str, list[float]]]:
     towards = float(target[:d] @ normal) * normal
     along = target[:d] - towards
     if not along.any():
-        along = -ASIDE * np.linalg.norm(towards) * _tangent(normal)
+        along = -ASIDE * np.linalg.norm(towards) * tangent(normal)
     for title, place in (
         ("straight towards the obstacle", towards),
         (f"{DEEPER:g} times as deep, twice as far the other way", DEEPER * towards - 2 * along),
         (f"{DEEP:g} times as deep, half as far the other way", DEEP * towards - along / 2),
     ):
         yield title, [*place.tolist(), *target[d:].tolist()]
-
-
-def _tangent(normal: Array) -> Array:
-    """A unit tangent of a plane."""
-    axis = np.eye(len(normal))[int(np.abs(normal).argmin())]
-    t = axis - float(axis @ normal) * normal
-    return np.asarray(t / np.linalg.norm(t))

@@ -16,11 +16,11 @@ CAPTIONS = {
     "accurate reduced one.",
 }
 NOTE = (
-    "The basis has the response to the hand, clamped modes, answers to a landing, and the response to every row: a "
-    "boundary node that may touch, or a hat function over several. The motion of the scene decides which nodes have "
-    "rows, and nothing else. z: relative error of the deformation over all nodes and steps; force: of the forces of "
-    "all obstacles over all steps. Held out: largest on motions that trained no model. depth: of a node in an "
-    "obstacle, which hat functions allow between them."
+    "The basis has the response to the hand, that to every row, which is a boundary node that may touch or a hat "
+    "function over several, and what a rich model needs beside them on the motion of the scene and on others along and "
+    "towards the obstacle; these choose the number of rows too. z: relative error of the deformation over all nodes "
+    "and steps; force: of the forces of all obstacles over all steps. Held out: largest on motions that trained no "
+    "model. depth: of a node in an obstacle, which hat functions allow between them."
 )
 ERRORS: Columns = {
     "rows": "p.rows", "count": "p.count", "N": "p.N", "z": "p.error %3", "force": "p.error_force %3",

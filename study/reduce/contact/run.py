@@ -26,7 +26,7 @@ def check_contact(scene: Scene) -> None:
         )
     if scene.reduction.methods:
         raise SceneError(
-            "reduction.methods does not go with effects.obstacles: a contact model has modes and the responses of "
+            "reduction.methods does not go with effects.obstacles: a contact model has the responses of "
             "nodes that may touch; leave it out"
         )
 
