@@ -29,6 +29,7 @@ from softgrasp.fem.mesh.check import (
 )
 from softgrasp.fem.mesh.singular import Ends
 from softgrasp.fem.mesh.tissue_mesh import Marks, MeshArrays, TissueMesh, Whole, spread, structured_mesh
+from softgrasp.fem.petsc import on_root
 from softgrasp.fem.shown import counted
 
 if TYPE_CHECKING:
@@ -231,8 +232,26 @@ def box_of_lines(comm: MPI.Intracomm, scene: Scene, cells: Sequence[int], mu: fl
     """
     axes, tissue = box_axes(scene), scene.tissue
     lines = [graded_line(a.cuts, a.ends, n, mu, radius) for a, n in zip(axes, cells, strict=True)]
-    box = structured_mesh(comm, tissue.size or [], [len(line) - 1 for line in lines], tissue.origin)
+    return _on_lines(comm, tissue.size or [], tissue.origin, lines)
+
+
+def _on_lines(
+    comm: MPI.Intracomm, size: Sequence[float], origin: Sequence[float] | None, lines: Sequence[Floats]
+) -> TissueMesh:
+    """The structured box with these lines, from side to side. Collective."""
+    box = structured_mesh(comm, size, [len(line) - 1 for line in lines], origin)
     x = box.mesh.geometry.x
-    for i, (line, length) in enumerate(zip(lines, tissue.size or [], strict=True)):
+    for i, (line, length) in enumerate(zip(lines, size, strict=True)):
         x[:, i] = line[np.rint((x[:, i] - line[0]) / length * (len(line) - 1)).astype(np.int64)]
     return box
+
+
+def on_each_rank(mesh: TissueMesh, scene: Scene) -> TissueMesh:
+    """A graded mesh of the scene on each rank alone: the mesh that one rank makes. Collective."""
+    comm, tissue = mesh.mesh.comm, scene.tissue
+    whole = on_root(comm, lambda: None if mesh.whole is None else _arrays(mesh.whole))
+    if whole is not None:
+        return spread(MPI.COMM_SELF, whole)
+    parts = comm.allgather([np.unique(mesh.mesh.geometry.x[:, i]) for i in range(mesh.dimension)])
+    lines = [np.unique(np.concatenate(along)) for along in zip(*parts, strict=True)]
+    return _on_lines(MPI.COMM_SELF, tissue.size or [], tissue.origin, lines)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from softgrasp.fem.errors import raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, rows_on_all, times_columns, total
+from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.run.states.snapshots import Snapshots
-from softgrasp.fem.system import BlockSystem, whole_system
+from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError
 
 
@@ -106,23 +106,6 @@ class States:
         self.kept.clear()
         self.kept[coordinates, frame] = made = parts[0] if len(parts) == 1 else Columns.beside(parts)
         return made
-
-
-def whole_states(states: States) -> States:
-    """The same states with all rows on every rank, for bases that each rank makes by itself. Collective.
-
-    Bases that use affine components or layers of the system cannot be made from them.
-    """
-    comm, n, system = states.layout.comm, states.layout.n_local, whole_system(states.system)
-    own = system.layout
-
-    def gathered(snapshots: Snapshots) -> Snapshots:
-        Z = np.empty((2 * own.n_e, snapshots.Z.shape[1]), order="F")
-        Z[: own.n_e], Z[own.n_e :] = rows_on_all(comm, snapshots.Z[:n]), rows_on_all(comm, snapshots.Z[n:])
-        return replace(snapshots, layout=own, Z=Z)
-
-    runs = tuple((whole_system(run), gathered(snapshots)) for run, snapshots in states.runs)
-    return States(system, runs, states.condensing)
 
 
 def states_of(system: BlockSystem, snapshots: Snapshots | None = None) -> States:

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
 
 from softgrasp.fem import Reduction
-from softgrasp.fem.errors import raise_on_all_ranks
-from softgrasp.fem.layout import BlockLayout
 from softgrasp.reduction import Basis, Truncation, registry
-from softgrasp.reduction.bases.states import BasisError, States, whole_states
+from softgrasp.reduction.bases.states import BasisError, States
 
 WHOLE_BYTES = 2.0**28  # of all snapshots up to which each rank or process holds their rows
 
@@ -45,34 +41,6 @@ def bases_of(
     return (), None
 
 
-Made = tuple[tuple[Basis, ...], int | None, dict[int, str]]
-"""Bases of one method, the columns that keep the scene's share of the energy, and the sizes refused."""
-
-
-def made_apart(tasks: Sequence[tuple[str, list[int]]], states: States, options: Reduction) -> dict[str, Made]:
-    """Bases of several methods, each made by one of several ranks, with all rows of small snapshots. Collective.
-
-    Left out, because all ranks make them together later: everything for large snapshots, and methods that use more
-    than snapshots and matrices.
-
-    ``tasks``: names and sizes.
-
-    Raises SolverError: a factorisation failed.
-    """
-    comm, layout = states.layout.comm, states.layout
-    apart = [(name, sizes) for name, sizes in tasks if name in registry.METHODS and registry.METHODS[name].snapshots]
-    if comm.size == 1 or len(apart) < 2 or not small(states):
-        return {}
-    # pairs factor twice as many columns: they are dealt first
-    apart.sort(key=lambda task: not registry.METHODS[task[0]].pairs)
-    whole, made = whole_states(states), dict[str, Made]()
-    with raise_on_all_ranks(comm):
-        for name, sizes in apart[comm.rank :: comm.size]:
-            refused: dict[int, str] = {}
-            made[name] = *bases_of(name, whole, sizes, options, refused), refused
-    return {name: _dealt(layout, made.get(name), i % comm.size) for i, (name, _) in enumerate(apart)}
-
-
 def small(states: States) -> bool:
     """Whether there are snapshots, and so few that each rank or process may hold all that is made of them."""
     size = sum(16 * states.layout.n_e * snapshots.Z.shape[1] for _, snapshots in states.runs)
@@ -100,17 +68,3 @@ def shares_of(names: Sequence[str], count: int = 2) -> list[list[str]]:
         shares[least] += group
         sums[least] += work(group)
     return shares
-
-
-def _dealt(layout: BlockLayout, made: Made | None, owner: int) -> Made:
-    """The local rows of bases whose rows are all on one rank. Collective."""
-    starts, parts = layout.comm.allgather((layout.start, layout.n_local)), None
-    nowhere: Any = None  # a communicator cannot be sent
-    if made is not None:
-        bases, *about = made
-        parts = [
-            (tuple(replace(b, layout=nowhere, V_q=b.V_q[i : i + n], V_p=b.V_p[i : i + n]) for b in bases), *about)
-            for i, n in starts
-        ]
-    bases, kept, refused = layout.comm.scatter(parts, root=owner)
-    return tuple(replace(b, layout=layout) for b in bases), kept, refused

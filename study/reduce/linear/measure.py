@@ -22,7 +22,7 @@ from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.propagator import Propagator
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
-from softgrasp.study.reduce.linear.bases import Made, bases_of, made_apart, shares_of, small
+from softgrasp.study.reduce.linear.bases import bases_of, shares_of, small
 from softgrasp.study.reduce.linear.ranks import dealt, divided
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
@@ -165,20 +165,16 @@ def untimed(
     full: FullRun,
     options: Reduction,
     progress: Progress = lambda done, of: None,
-    made: Made | None = None,
     states: States | None = None,
 ) -> Untimed:
     """One method at all its N without times. Collective. Raises SolverError: a factorisation failed.
 
     Args:
-        made: its bases, as of :func:`softgrasp.study.reduce.linear.bases.made_apart`; None: made here.
         states: of the run, which several methods share; None: made here.
     """
     refused: dict[int, str] = {}
-    if made is None:
-        states = states or states_of(full.model.system, full.snapshots)
-        made = *bases_of(name, states, options.N, options, refused), refused
-    bases, N_energy, refused = made
+    states = states or states_of(full.model.system, full.snapshots)
+    bases, N_energy = bases_of(name, states, options.N, options, refused)
     found: list[Measured] = []
     for each in measured(bases, full, refused, progress):
         found.append(each)
@@ -187,11 +183,9 @@ def untimed(
     return Untimed(name, found, refused, N_energy, (bases[0].sigma, bases[0].inner) if bases else ((), ""))
 
 
-def sweep(
-    name: str, full: FullRun, options: Reduction, progress: Progress = lambda done, of: None, made: Made | None = None
-) -> MethodSweep:
+def sweep(name: str, full: FullRun, options: Reduction, progress: Progress = lambda done, of: None) -> MethodSweep:
     """One method at all its N, as :func:`untimed`, with its times. Collective. Raises SolverError: as there."""
-    found = untimed(name, full, options, progress, made)
+    found = untimed(name, full, options, progress)
     return found.sweep(found.times(full))
 
 
@@ -212,14 +206,13 @@ def sweep_all(
     every = states = states_of(full.model.system, full.snapshots)
     with suppress(BasisError):  # each method states what is wrong with the snapshots
         states = condensed(every)
-    made = made_apart([(name, options.N) for name in names], states, options)
 
     def one(name: str) -> Untimed:
         def progress(done: int, of: int) -> None:
             say(name, size * names.index(name) + size * done // of, size * len(names))
 
         used = states if name in registry.METHODS else every  # a user's basis may need the columns in time
-        return untimed(name, full, options, progress, made.pop(name, None), used)
+        return untimed(name, full, options, progress, used)
 
     parts = shares_of(names, ranks.size if ranks.size > 1 else 2 if small(states) else 1)
     same = full.model.system.layout, *map(registry.find_method, names)
@@ -236,13 +229,11 @@ def box_models(
     outputs, options, models = full.model.outputs, full.model.scene.reduction, []
     tested = [s for s, _ in by_error(sweeps)[:METHODS_TESTED]]
     sizes = [sorted({p.N for N in (COMPARED, LARGER) if (p := nearest(s.points, N)) is not None}) for s in tested]
-    tasks = [(s.method.key, own) for s, own in zip(tested, sizes, strict=True)]
-    made = made_apart(tasks, states, options) if states else {}
 
     def trained(s: MethodSweep, wanted: list[int]) -> list[ReducedModel]:
         if states is None or not s.method.snapshots:
             return []
-        bases, *_ = made.get(s.method.key) or bases_of(s.method.key, states, wanted, options, {})
+        bases, _ = bases_of(s.method.key, states, wanted, options, {})
         return [project_scene(b, full.model, outputs) for b, _ in zip(bases, wanted, strict=False)]
 
     same = full.model.system.layout, *(s.method for s in tested)

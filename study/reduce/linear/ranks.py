@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 from mpi4py import MPI
@@ -19,17 +20,21 @@ MODEL_BYTES = 2.0**30  # of matrices and factor of one model up to which each ra
 def of_each_rank(model: Model, scene: Scene) -> tuple[Model, MPI.Intracomm]:
     """The model on each rank alone, and the ranks that divide work; where its run is large, itself and no others.
 
-    Large are runs with more states or larger matrices than each rank shall hold, and graded meshes, which are estimated
-    while they are made. Collective.
+    Large are runs with more states or larger matrices than each rank shall hold. Collective.
     """
     layout = model.system.layout
     states, held = 16 * layout.n_e * (scene.time.steps + 1), need(scene, layout.dimension, model.cells, 1, True)
     large = states > WHOLE_BYTES or held.of(1.0, 1) > MODEL_BYTES
-    if layout.comm.size == 1 or large or scene.tissue.refine is not None:
+    if layout.comm.size == 1 or large:
         return model, MPI.COMM_SELF
+    mesh = None
+    if scene.tissue.refine is not None:
+        from softgrasp.fem.mesh.grading import on_each_rank  # only scenes with graded cells pay for it
+
+        mesh = on_each_rank(model.space.mesh, scene)
     with raise_on_all_ranks(layout.comm):
-        own = build(scene, comm=MPI.COMM_SELF)
-    return own, layout.comm
+        own = build(scene, comm=MPI.COMM_SELF, mesh=mesh)
+    return replace(own, accuracy=model.accuracy), layout.comm
 
 
 def divided[T](

@@ -16,6 +16,7 @@ from softgrasp.reduction.system import ModelError
 from softgrasp.study.pictures import draw_in_background
 from softgrasp.study.pull.page import pull_page
 from softgrasp.study.reduce.linear import measure
+from softgrasp.study.reduce.linear.memory import check_states
 from softgrasp.study.reduce.linear.page import compose, findings
 from softgrasp.study.reduce.linear.ranks import of_each_rank
 from softgrasp.study.reduce.linear.result import MethodSweep, ReductionStudy, best, by_error
@@ -29,6 +30,7 @@ def run_linear(session: Session, scene: Scene, names: Sequence[str]) -> dict[str
     """Reduce the scene by the methods of these names, and write the results. Collective."""
     watch = Stopwatch(session.comm)
     model, ranks = of_each_rank(session.model(scene), scene)
+    check_states(model, session.comm)
     with session.counting("full run") as say:
         with watch.stage("full"):
             full, times = measured_run(model, say, ranks)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +12,23 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem import forked as processes
-from softgrasp.fem.model.build import build
-from softgrasp.fem.model.memory import Need
+from softgrasp.fem.accuracy import adapt
+from softgrasp.fem.errors import ResourceError
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.model.memory import GIB, Need
 from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS, make_bases
-from softgrasp.reduction.bases.states import States, states_of
+from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.parameters import training_of, training_states
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, full_run, replay_linear
 from softgrasp.reduction.system import ModelError
 from softgrasp.study.reduce.linear import measure
-from softgrasp.study.reduce.linear.bases import bases_of, made_apart
 from softgrasp.study.reduce.linear.measure import FURTHER, box_models, headline_turns, measure_box, sweep, untimed
+from softgrasp.study.reduce.linear.memory import check_states
 from softgrasp.study.reduce.linear.ranks import dealt, of_each_rank
 from softgrasp.study.reduce.times import measured_run
 from tests.helpers.models import gather_matrix, gather_rows, gather_states, make_scene
@@ -268,24 +271,38 @@ def test_ranks_with_the_whole_model_each_divide_the_work(comm: MPI.Intracomm, mo
 
 
 @pytest.mark.ranks
-def test_bases_of_one_rank_are_those_of_all_ranks_together(small: FullRun) -> None:
-    states, options = states_of(small.model.system, small.snapshots), wanted(small, [8, 14])
-    names = ("pod_fixed", "psd", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "craig_bampton")
-    apart = made_apart([(name, [3, 8, 14, 4000]) for name in names], states, options)
-    layout = states.layout
-    assert set(apart) == (set() if layout.comm.size == 1 else set(names[:-1]))  # the last uses no snapshots
-    for name, (bases, kept, refused) in apart.items():
-        reasons: dict[int, str] = {}
-        others, own = bases_of(name, states, [3, 8, 14, 4000], options, reasons)
-        assert (kept, refused) == (own, reasons), name
-        for one, all_ranks in zip(bases, others, strict=True):
-            assert one.layout is layout
-            assert one.N == all_ranks.N
-            V, W = (gather_states(layout, np.vstack([b.V_q, b.V_p])) for b in (one, all_ranks))
-            first = 4 if one.fixed_solid else 0  # columns of the hand alone
-            V, W = (np.linalg.qr(X[:, first:] / np.linalg.norm(X[:, first:], axis=0))[0] for X in (V, W))
-            # rounding of the snapshots over the gap of the singular values
-            assert np.linalg.norm(V - W @ (W.T @ V)) < 1e-6, (name, one.N)
+def test_states_that_leave_no_memory_for_bases_are_refused_before_the_run(comm: MPI.Intracomm) -> None:
+    """Every rank counts: one model spread over all needs what it needs on one, a whole one on each so many times."""
+    model = build(load_scene(PAPER, SMALL), comm=comm)  # n_e = 116, 121 states
+    whole, _ = of_each_rank(model, model.scene)
+
+    def allowed(of: Model, memory: float, every: int = 1) -> Model:
+        output = of.scene.output.model_copy(update={"memory": memory / GIB, "every": every})
+        return replace(of, scene=of.scene.model_copy(update={"output": output}))
+
+    states = 16 * 116 * 121
+    assert model.system.layout.n_e == 116
+    check_states(allowed(model, 8.01 * states), comm)
+    check_states(allowed(whole, 8.01 * comm.size * states), comm)
+    for each, size in ((model, 1), (whole, comm.size)):
+        short = 8 * size * states / 2.5
+        with pytest.raises(ResourceError, match=r"keeps 121 states of 232 numbers.* set output\.every = 3,"):
+            check_states(allowed(each, short), comm)
+        check_states(allowed(each, short, every=3), comm)
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("refine", ['{method="lines"}', '{method="bisect", tolerance=0.2, passes=1}'])
+def test_each_rank_has_the_graded_mesh_of_one_rank(comm: MPI.Intracomm, refine: str) -> None:
+    """The same bits, with the estimate that all ranks made together."""
+    scene = load_scene(PAPER, [*SMALL, f"tissue.refine={refine}"])
+    alone, model = (adapt.build(scene, comm=each) for each in (MPI.COMM_SELF, comm))
+    own, ranks = of_each_rank(model, scene)
+    assert (own is model, ranks.size) == (comm.size == 1, comm.size)
+    assert own.accuracy is model.accuracy
+    for key in ("K_ee", "M_ee"):
+        A, B = (to_scipy(getattr(each.system, key)).toarray() for each in (own, alone))
+        assert np.array_equal(A, B)
 
 
 @pytest.mark.serial
