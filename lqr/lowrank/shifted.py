@@ -13,14 +13,14 @@ import scipy.sparse.linalg
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from softgrasp.fem.errors import ResourceError, SolverError, raise_on_all_ranks
+from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, Complex, PETSc, from_options, petsc_options, whole_copy
-from softgrasp.fem.resources import cores, free_memory
+from softgrasp.fem.resources import cores
 from softgrasp.fem.solve.cholesky import direct_solves, package_of
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.lowrank.ahead import FactorsAhead
-from softgrasp.lqr.plant.checks import MODAL_KEY
+from softgrasp.lqr.lowrank.memory import check_gathered_memory, check_shifted_memory
 
 PREFIX = "softgrasp_shifted_"
 WORKSPACE: dict[str, object] = {"mat_mumps_icntl_14": 40}  # percent beyond the estimate: pivots of an indefinite matrix
@@ -127,7 +127,7 @@ class GatheredTissue(ShiftedTissue):
         self.cache: Factors = {}
         self.ahead: FactorsAhead | None = None
         threads = THREADS[layout.dimension]
-        if MPI.COMM_WORLD.size == 1 and layout.n_e >= AHEAD_FROM and cores() > 1:
+        if makes_ahead(layout):
             self.ahead = FactorsAhead(self._make, threads)
         # one for each thread, filled anew for each shift, because making one checks its indices
         self.shells = [scipy.sparse.csc_matrix(self.K) for _ in range(1 if self.ahead is None else threads)]
@@ -341,6 +341,11 @@ class DistributedTissue(ShiftedTissue):
         self.S.destroy()
 
 
+def makes_ahead(layout: BlockLayout) -> bool:
+    """Whether other cores make the next factors of a program of one rank."""
+    return MPI.COMM_WORLD.size == 1 and layout.n_e >= AHEAD_FROM and cores() > 1
+
+
 def make_shifted(system: BlockSystem, name: str = "auto") -> ShiftedTissue:
     """The solver for a size: ``gathered`` or ``distributed``. Collective.
 
@@ -352,27 +357,9 @@ def make_shifted(system: BlockSystem, name: str = "auto") -> ShiftedTissue:
         small = system.layout.n_e <= GATHER_LIMIT[system.layout.dimension]
         name = "gathered" if small else "distributed"
     if name == "gathered":
+        check_gathered_memory(system.layout, makes_ahead(system.layout))
         return GatheredTissue(system)
     if name == "distributed":
         check_shifted_memory(system.layout)
         return DistributedTissue(system)
     raise SolverError(f"the shifted solver {name!r} is unknown; choose auto, gathered or distributed")
-
-
-def shifted_factor_bytes(n: int, dimension: int) -> float:
-    """Memory of MUMPS to factor S(p) of order n, all ranks together: 240 n log2 n in 2D, 800 n^(4/3) in 3D.
-
-    Fitted to n = 6 558 to 103 038 in 2D and n = 7 227 to 52 857 in 3D.
-    """
-    return 240 * n * float(np.log2(max(n, 2))) if dimension < 3 else 800 * n ** (4 / 3)
-
-
-def check_shifted_memory(layout: BlockLayout) -> None:
-    """The factor of S(p) fits in the memory that is free now. Collective. Raises ResourceError: it does not."""
-    needed = shifted_factor_bytes(layout.n_e, layout.dimension) / 2**30
-    free = layout.comm.bcast(free_memory()) / 2**30
-    if needed > free:
-        raise ResourceError(
-            f"the factor of the shifted tissue matrix (n_e = {layout.n_e} in {layout.dimension}D) needs about "
-            f"{needed:.1f} GiB and {free:.1f} GiB are free; use fewer cells, or set {MODAL_KEY}"
-        )

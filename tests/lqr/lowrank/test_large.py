@@ -18,10 +18,11 @@ from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.lowrank.adjoint import AdjointRhs
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
+from softgrasp.lqr.lowrank.memory import HELD, LU_BYTES, gathered_bytes, shifted_factor_bytes
 from softgrasp.lqr.lowrank.newton import Iteration, NewtonADI, load_state
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.radi import RADI
-from softgrasp.lqr.lowrank.shifted import make_shifted, shifted_factor_bytes
+from softgrasp.lqr.lowrank.shifted import GatheredTissue, make_shifted
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.riccati import tissue_gain_error
 from softgrasp.lqr.riccati import choose, solve
@@ -178,6 +179,28 @@ def test_factor_that_does_not_fit_is_refused_before_it_is_made(monkeypatch: pyte
         else:
             with pytest.raises(ResourceError, match=r"n_e = \d+ in 3D\) needs about .* GiB are free"):
                 make_shifted(problem.system, "distributed")
+
+
+def test_whole_matrices_and_factors_on_each_rank_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    system = paper("tissue.cells=[20,40]").system
+    layout, needed = system.layout, gathered_bytes(system.layout.n_e, 2, 1, ahead=False)
+    tissue = GatheredTissue(system)
+    tissue.solve(-1 + 30j, np.zeros((layout.n_local, 2)))
+    factor = tissue.cache[-1 + 30j][1]
+    assert factor is not None
+    held = HELD * factor.nnz * LU_BYTES
+    held += sum(A.data.nbytes + A.indices.nbytes for A in (tissue.K, tissue.M, tissue.shells[0]))
+    tissue.destroy()
+    assert (
+        1 <= needed / held < 1.5
+    )  # the number of entries is estimated, 1.2 times what it is; indices are counted once
+    for free, fits in ((1.01 * needed, True), (0.99 * needed, False)):
+        monkeypatch.setattr("psutil.virtual_memory", lambda free=free: SimpleNamespace(available=free))
+        if fits:
+            make_shifted(system, "gathered").destroy()
+        else:
+            with pytest.raises(ResourceError, match=r"n_e = \d+ in 2D\) needs about .* GiB are free"):
+                make_shifted(system, "gathered")
 
 
 def test_inputs_on_the_tissue_without_a_hand() -> None:
