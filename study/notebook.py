@@ -18,14 +18,15 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem import Array, Model, OutputColumn, PictureMesh, ReducedSystem, SoftgraspError, Trajectory, percent
-from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
+from softgrasp.fem.fields.picture import gather_picture, vertex_displacement, vertex_values
 from softgrasp.fem.labelled import package
+from softgrasp.fem.run.states.snapshots import FILMED, spread
 from softgrasp.lqr import LoopMargins, LoopTrajectory
 from softgrasp.reduction import ReducedModel, ReducedTrajectory, online
 from softgrasp.reduction.reduce import errors, replay
 from softgrasp.reduction.replay import full_run, replay_inputs
 from softgrasp.study.control.plots import bode
-from softgrasp.study.pictures import MOST_FRAMES, histories, move_bytes
+from softgrasp.study.pictures import histories, move_bytes
 from softgrasp.study.pictures.contact import contact_figure
 from softgrasp.study.pictures.style import CYCLE, FULL, WIDTH, length_unit, log_axis, paper_style
 from softgrasp.study.pictures.traces import traces
@@ -230,16 +231,32 @@ def pulled(rom: ReducedModel, model: Model) -> View:
 
 
 def animation(run: Trajectory | LoopTrajectory, model: Model) -> Film:
-    """The move as an animated picture, of a free run with its target. Collective; rank 0 draws, the others get nothing.
+    """The move as an animated picture, of a free run with its target, at obstacles with the pressure of contact.
+
+    Collective; rank 0 draws, the others get nothing.
 
     Raises SoftgraspError: the run kept no snapshots.
     """
     picture, states, _, times = _shown(run, model)
+    tractions = _tractions(run, model)
     if picture is None or states is None:
         return Film(b"")
     table: Array = np.column_stack([run.times, run.q_s])
     target = model.scene.motion.target if isinstance(run, Trajectory) else None  # a loop may go elsewhere
-    return Film(move_bytes(picture, states, times, table, target))
+    return Film(move_bytes(picture, states, times, table, target, tractions))
+
+
+def _tractions(run: Trajectory | LoopTrajectory, model: Model) -> Array | None:
+    """Pressure of contact at the vertices at the instants of `_shown`, (k, n, d) [Pa]; None without. Collective."""
+    if run.contact is None or not run.contact.pressing.any():
+        return None
+    from softgrasp.fem.fields.traction import ContactTraction  # only runs with contact pay for it
+    from softgrasp.fem.run.contact.general import contact_surface
+
+    traction, surface = ContactTraction(model), contact_surface(model)
+    every = [vertex_values(model, traction(surface, forces)) for forces in run.contact.pressing]
+    there = [values for values in every if values is not None]  # on rank 0
+    return np.stack(there) if there else None
 
 
 def _shown(run: Trajectory | LoopTrajectory, model: Model) -> tuple[PictureMesh | None, Array | None, Array, Array]:
@@ -248,7 +265,7 @@ def _shown(run: Trajectory | LoopTrajectory, model: Model) -> tuple[PictureMesh 
     if kept is None:
         cure = "set output.snapshots" if isinstance(run, Trajectory) else "give its LoopOptions snapshots"
         raise SoftgraspError(f"the run kept no snapshots in memory; {cure} = 'memory'")
-    pick = np.unique(np.linspace(0, len(kept.steps) - 1, MOST_FRAMES).round().astype(int))
+    pick = spread(len(kept.steps), FILMED)
     n = kept.layout.n_local
     states = vertex_displacement(model, kept.Z[:n, pick], kept.q_s[:, pick])
     return gather_picture(model), states, kept.q_s[:, pick].T, kept.times[pick]

@@ -99,6 +99,7 @@ class Run(Stepped):
             from softgrasp.fem.run.contact.step import make_contact  # only scenes with contact pay for it
 
             self.drive, self.contact = make_contact(model, midpoint, self._make_drive(force), self.steps)
+            self.contact.table.film(store.steps)
         else:
             self.drive = self._make_drive(force)
         self.ledger = Ledger(midpoint, self.drive.c, self.contact)

@@ -259,6 +259,7 @@ class LoopRun(Stepped):
         self.contact: Contact | None = getattr(drive, "contact", None)
         self.midpoint.start(self.state)
         if self.contact is not None:
+            self.contact.table.film(store.steps)
             self.contact.start(self.state, drive.q[0])
         # two microseconds a step
         self.ledger = Ledger(self.midpoint, np.zeros((steps, problem.layout.n_s)), self.contact)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from softgrasp._face import face
 
 if TYPE_CHECKING:
-    from softgrasp.study.pictures.animation import MOST_FRAMES, film, gif_bytes, move_bytes, timing, write_gif
+    from softgrasp.study.pictures.animation import film, gif_bytes, move_bytes, timing, write_gif
     from softgrasp.study.pictures.background import draw_in_background
     from softgrasp.study.pictures.body import figure_move
     from softgrasp.study.pictures.frames import Frames

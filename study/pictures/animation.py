@@ -16,12 +16,12 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from softgrasp.fem import Array, PictureMesh, note
+from softgrasp.fem.run.states.snapshots import FILMED
 from softgrasp.study.pictures import body
 from softgrasp.study.pictures.plate import around_bodies
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.pictures.style import TARGET, colour_map, fit, paper_style
 
-MOST_FRAMES = 60
 TICKS = 2  # shortest time of a frame [1/100 s]; viewers slow down what is shorter
 MOST_BYTES = 3_000_000
 DPI = 110
@@ -63,7 +63,7 @@ def move_bytes(
 
 def timing(times: Array) -> tuple[list[int], list[int]]:
     """Frames to show, at most 60, and how long each [ms]; rounding errors do not add up, and the last stays longer."""
-    chosen = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_FRAMES)).round().astype(int)).tolist()
+    chosen = np.unique(np.linspace(0, len(times) - 1, min(len(times), FILMED)).round().astype(int)).tolist()
     at = np.round(100 * (times - times[0]) / speed_up(times)).astype(int)  # GIF counts in hundredths of a second
     kept = chosen[:1]
     for i in chosen[1:]:

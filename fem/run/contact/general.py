@@ -357,7 +357,8 @@ class Contact:
         table, (work, touch, stopped, rubbed) = self.table, self.table.energies.tolist()
         return ContactRecord(
             tuple(o.name for o in self.obstacles), table.force, table.impulse, table.gap, table.touching,
-            table.chattering, work, touch, stopped, rubbed, self.small.rounds, self.responses.count, self.p,
+            table.chattering, np.array(list(table.instants), dtype=int), table.pressing, work, touch, stopped, rubbed,
+            self.small.rounds, self.responses.count, self.p,
         )  # fmt: skip
 
     def restart_arrays(self) -> dict[str, Array]:
@@ -365,7 +366,8 @@ class Contact:
         keys = self.responses.keys[: self.responses.count]
         parts: list[NDArray[Any]] = [
             self.table.sums.ravel(), np.array([self.fastest]), self.small.tally, keys.ravel(),
-            np.array(self.responses.blocks), self.strike.nodes(), self.table.lately.ravel(), *self._sets(),
+            np.array(self.responses.blocks), self.strike.nodes(), self.table.lately.ravel(),
+            self.table.pressing.ravel(), *self._sets(),
         ]  # fmt: skip
         sizes = np.array([len(parts), *(len(part) for part in parts)])
         return {"solver_rows": self.table.packed(self.n + 1), "solver_numbers": np.concatenate([sizes, *parts])}
@@ -379,11 +381,12 @@ class Contact:
         self.table.unpack(rows)
         count = 1 + int(numbers[0])
         ends = np.cumsum(numbers[1:count].astype(int))
-        energy, fastest, tally, keys, blocks, struck, lately, *sets = np.split(numbers[count:], ends)[:-1]
+        energy, fastest, tally, keys, blocks, struck, lately, film, *sets = np.split(numbers[count:], ends)[:-1]
         self.table.sums[:], self.fastest, self.small.tally[:] = energy.reshape(2, 4), float(fastest[0]), tally
         self.responses.again([(int(i), int(k)) for i, k in keys.reshape(-1, 2)], blocks.astype(int).tolist())
         self.strike.restore(struck.astype(int))
-        self.table.lately[:] = lately.reshape(self.table.lately.shape)
+        for kept, values in ((self.table.lately, lately), (self.table.pressing, film)):
+            kept[:] = values.reshape(kept.shape)
         self._resume(sets)
 
     def _resume(self, sets: list[Array]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.displacement import exact_sum
+from softgrasp.fem.run.states.snapshots import FILMED, spread
 from softgrasp.fem.shown import Shown
 
 
@@ -30,6 +32,10 @@ class ContactRecord(Shown):
     chattering: NDArray[Any]
     """Number of boundary nodes whose touching each obstacle takes back in each step, (steps, obstacles): it changed in
     the step before."""
+    instants: NDArray[Any]
+    """Steps at whose end ``pressing`` is kept, those that a film of the run shows, (instants,)."""
+    pressing: Array
+    """Force on each boundary node in the steps that end there, without impulses, (instants, p, d) [N]."""
     work: float
     """Work of the contact on the tissue in the frame of the hand, impulses included [J]."""
     touch: float
@@ -81,6 +87,8 @@ class Tables:
     energy: Array  # work, and energy dissipated at first touch, by impulses and by friction, in a step, (4,) [J]
     sums: Array  # of ``energy`` over the steps, and what rounding of these sums lost, (2, 4) [J]
     lately: NDArray[np.int8]  # 1 of nodes that touched in the last step, and 2 where that changed then, (obstacles, p)
+    instants: dict[int, int]  # number of each instant of a film by its step
+    pressing: Array  # forces on the boundary nodes in the steps that end there, (instants, p, d) [N]
 
     @staticmethod
     def empty(steps: int, obstacles: int, p: int, d: int, n_s: int) -> Tables:
@@ -89,7 +97,19 @@ class Tables:
         hand, kick = np.zeros((2, steps, n_s))
         gap, (touching, chattering) = np.zeros((steps + 1, obstacles)), np.zeros((2, steps, obstacles))
         energy, sums, lately = np.zeros(4), np.zeros((2, 4)), np.zeros((obstacles, p), dtype=np.int8)
-        return Tables(force, impulse, gap, touching, chattering, hand, kick, energy, sums, lately)
+        none = np.zeros((0, p, d))
+        return Tables(force, impulse, gap, touching, chattering, hand, kick, energy, sums, lately, {}, none)
+
+    def film(self, steps: NDArray[Any]) -> None:
+        """Keep the forces of a film of states at these steps, (m,)."""
+        shown = steps[spread(len(steps), FILMED)].tolist() if len(steps) else []
+        self.instants = {step: i for i, step in enumerate(shown)}
+        self.pressing = np.zeros((len(shown), *self.pressing.shape[1:]))
+
+    def show(self, n: int, pressing: Callable[[], Array]) -> None:
+        """Keep the forces of the step that ends at n where a film shows it; pressing: returns them, (p, d) [N]."""
+        if (i := self.instants.get(n)) is not None:
+            self.pressing[i] = pressing()
 
     def count_back(self, n: int, obstacle: NDArray[np.intp], node: NDArray[np.intp]) -> None:
         """Count what takes back its last change in step n, where these pairs of obstacle and node, (k,), touch."""

@@ -41,6 +41,7 @@ class Touching(TissueMidpoint):
         if landing is not None:
             landing.finish(self, new)
         contact.table.add()
+        contact.table.show(contact.n + 1, contact.pressing)
 
     def mends(self) -> bool:
         """Whether the momentum of a step can lose its residual: K, M and their multiples are all that S has."""

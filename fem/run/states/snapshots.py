@@ -15,6 +15,8 @@ from softgrasp.fem.run.midpoint import TissueState, state_on
 from softgrasp.fem.shown import Shown
 from softgrasp.fem.system import BlockSystem
 
+FILMED = 60  # stored states that a film of a run shows, at most [1]
+
 
 @dataclass(frozen=True, repr=False)
 class Snapshots(Shown):

@@ -235,7 +235,7 @@ def test_restart_in_contact_repeats_the_bits(overrides: list[str], mpi_tmp_path:
     again = simulate(build("paper_forward", [*SMALL, ON, *overrides]), RunOptions(mpi_tmp_path, resume=True))
     assert whole.contact.touching[:101].max() > 0
     assert np.array_equal(again.final, whole.final)
-    for name in ("force", "impulse", "gap", "touching", "chattering"):
+    for name in ("force", "impulse", "gap", "touching", "chattering", "pressing"):
         assert np.array_equal(getattr(again.contact, name), getattr(whole.contact, name))
     assert again.energy_drift == whole.energy_drift
     assert again.contact.touch == whole.contact.touch

@@ -137,7 +137,7 @@ def test_a_restart_repeats_the_bits(overrides: list[str], mpi_tmp_path: Path) ->
     again = simulate(build("paper_forward", [*SMALL, *overrides]), RunOptions(mpi_tmp_path, resume=True))
     assert whole.contact.touching[:70].max() > 0
     assert np.array_equal(again.final, whole.final)
-    for name in ("force", "impulse", "gap", "touching", "chattering"):
+    for name in ("force", "impulse", "gap", "touching", "chattering", "pressing"):
         assert np.array_equal(getattr(again.contact, name), getattr(whole.contact, name))
 
 

@@ -59,7 +59,7 @@ def test_restart_in_contact_repeats_the_bits(mpi_tmp_path: Path) -> None:
     assert whole.contact.touching[:30].max() > 0
     assert whole.newton.factors > 0
     assert np.array_equal(again.final, whole.final)
-    for name in ("force", "impulse", "gap", "touching", "chattering"):
+    for name in ("force", "impulse", "gap", "touching", "chattering", "pressing"):
         assert np.array_equal(getattr(again.contact, name), getattr(whole.contact, name))
     assert again.energy_drift == whole.energy_drift
 
