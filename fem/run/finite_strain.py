@@ -58,8 +58,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.drag = drag if self.system.damping.active else None
         for part in self.operators.parts:
             part.convert("aij")
-        self.trial, self.f, self.y, self.solved = (self.w.duplicate() for _ in range(4))
-        vectors = (self.trial, self.f, self.y, self.solved)
+        self.trial, self.f, self.y, self.solved = vectors = [self.w.duplicate() for _ in range(4)]
         self.trial_array, self.f_array, self.y_array, self.solved_array = (x.array_w for x in vectors)
         self.newton = self._make_iteration(Pairs(self._dots, len(self.w_array)))
         self.past: deque[Array] = deque(maxlen=STEPS)
@@ -97,8 +96,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         return float(np.clip((self.solver.entries or 0.0) / (4 * self.system.layout.n_e), 8, 100))
 
     def _dots(self, A: Array, x: Array) -> Array:
-        products = A @ x
-        return products if self.operators.whole else total(self.comm, products)
+        return np.asarray(A @ x if self.operators.whole else total(self.comm, A @ x))
 
     def _all(self, fine: bool) -> bool:
         return fine if self.operators.whole else bool(self.comm.allreduce(fine, MPI.LAND))
@@ -203,12 +201,12 @@ class FiniteStrainMidpoint(TissueMidpoint):
         counts.iterations, counts.steps = counts.iterations + root.iterations, counts.steps + 1
         counts.most = max(counts.most, root.iterations)
 
-    def _find(self, guess: Array, least: int = 0) -> Root:
-        """The root, moved to w'R = 0 if it took ``least`` iterations or more. Collective."""
+    def _find(self, guess: Array, balanced: bool = True) -> Root:
+        """The root, moved to w'R = 0 if it is to be ``balanced``. Collective."""
         target = max(self.tol * self.substeps * self.counts.scale, 4 * self.body.rounding)
         root = self.newton.find(guess, target)
-        moved = self._balance(root) if root.iterations >= least else None
-        if root.iterations >= least and moved is None:  # the residual does work: iterate on
+        moved = None
+        if balanced and root.iterations >= 0 and (moved := self._balance(root)) is None:  # R does work: iterate on
             finer = self.newton.find(root.x, max(target / 30, 4 * self.body.rounding))
             root = root if finer.iterations < 0 else finer._replace(iterations=root.iterations + finer.iterations)
             moved = self._balance(root)
@@ -221,8 +219,10 @@ class FiniteStrainMidpoint(TissueMidpoint):
         if work == 0:
             return root.x
         bends = np.diag(pairs.products)  # dx'dr: w'R changes by -t (w'dr + dx'R) + t^2 dx'dr from w to w - t dx
-        slopes = self._dots(pairs.dr, root.x) + self._dots(pairs.dx, root.R)
-        i = int(np.argmax(np.abs(slopes)))  # zero in an empty slot
+        slopes = self._dots(pairs.dr, root.x) + self._dots(pairs.dx, root.R)  # zero in an empty slot
+        # R bends along dx, and w'R is left with it: of this step's corrections the one with the least t dx'dr
+        near = [i for i in pairs.order if abs(slopes[i]) > 100 * abs(work)]
+        i = min(near, key=lambda i: bends[i] / abs(slopes[i])) if near else int(np.argmax(np.abs(slopes)))
         if abs(work) >= 0.1 * abs(slopes[i]):
             return None
         t = work / slopes[i]

@@ -247,7 +247,7 @@ def pressed(**parts: Any) -> Act:
     """A step with contact at finite strain, in this state."""
     law = SimpleNamespace(law=SimpleNamespace(name="stvk"))
     step: Any = SimpleNamespace(free_load=0.0, w_array=0.0, body=law, **parts)
-    return lambda *_: FiniteContactMidpoint.press(step, np.zeros(1), np.zeros(1), False)
+    return lambda *_: FiniteContactMidpoint.press(step, np.zeros(1), np.zeros(1))
 
 
 def no_root(_: Path, patch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,8 @@
 
 A round solves the small problem with W = N S^-1 N' of the tangent S that the step has, from the gaps of the last round,
 and the step under the new forces; the responses are made anew where the tangent was. Forces do the work 2 x'Nw, as in
-the linear step, and the step has w'R = 0, so that the balance of energy closes.
+the linear step. At the end of the rounds w is scaled to w'R = 0, so that the balance of energy closes: of all changes
+of w that do so, that is the smallest in the norm of S, and no larger there than the error that R leaves.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from softgrasp.fem.run.finite_strain import FiniteStrainMidpoint
 from softgrasp.fem.run.midpoint import Feedback
 from softgrasp.fem.run.motion import Driven
 
-BALANCED = 8  # rounds that move w to w'R = 0; near rest, where w'R is no work to speak of, this would not end
+EPS = float(np.finfo(float).eps)
+SHARE = EPS**0.5  # of w, over which the change of R is found: small are both its rounding and its bend along w [1]
+MOST_SCALED = 1e-3  # of w: near rest w is an error of the step as R is, and w'R no work to speak of [1]
 CLOSE = 1e-13  # of the body: gaps of pressed nodes at the end of the rounds [1]
 
 
@@ -32,10 +35,8 @@ class FiniteContactMidpoint(Touching, FiniteStrainMidpoint):
         super().solve_midpoint(c, feedback)
         self.free_load = self.right
 
-    def press(self, pressing: Array, change: Array, balanced: bool) -> None:
+    def press(self, pressing: Array, change: Array) -> None:
         """Solve the step anew from w + change under further forces on the rows here. Collective.
-
-        ``balanced``: with w'R = 0 also where w + change is a solution to the tolerance already.
 
         Raises SolverError: no convergence.
         """
@@ -44,7 +45,7 @@ class FiniteContactMidpoint(Touching, FiniteStrainMidpoint):
                 "contact at finite strain cannot act in a step that is divided into substeps; raise time.steps"
             )
         self.right = self.free_load + pressing
-        root = self._find(self.w_array + change, least=1)
+        root = self._find(self.w_array + change, balanced=False)
         if root.iterations < 0:
             raise SolverError(
                 f"contact at finite strain ({self.body.law.name}): the step does not converge under the forces of the "
@@ -53,8 +54,19 @@ class FiniteContactMidpoint(Touching, FiniteStrainMidpoint):
         counts = self.counts
         counts.iterations += root.iterations
         counts.most = max(counts.most, root.iterations)
-        moved = self._balance(root) if balanced and root.iterations == 0 else None  # else it has w'R = 0 already
-        self.w.array_w[:] = root.x if moved is None else moved
+        self.w.array_w[:], self.R = root.x, root.R
+
+    def balance(self) -> bool:
+        """Scale w to w'R = 0 and say whether that changed it. Collective."""
+        w = self.w_array
+        work = self.dot(w, self.R)
+        if abs(work) <= EPS * self.dot(np.abs(w), np.abs(self.right)):  # rounding of the loads' own work
+            return False
+        change = self.dot(w, self.R - self._residual((1 - SHARE) * w)[0]) / SHARE
+        if abs(work) > MOST_SCALED * change:
+            return False
+        self.w.array_w[:] = w - work / change * w
+        return True
 
 
 class FiniteContact(Contact):
@@ -83,20 +95,28 @@ class FiniteContact(Contact):
             rows.x = self.small.solve(len(q), W, q - C @ self.responses.G[:m, :m] @ f0, tol / 4).copy()
             f = C.T @ rows.x
             pressing[self.places] = self.surface.on_nodes(self.responses.forces(f))[self.order]
-            midpoint.press(pressing, self.responses.columns[:, :m] @ (f - f0), count < BALANCED)
+            midpoint.press(pressing, self.responses.columns[:, :m] @ (f - f0))
             before, pressed = rows, rows.x > 0
             active[:] = False
             active[rows.obstacle[pressed], rows.node[pressed]] = True
-            x1 = x0 + self._way(n)
-            self.after = self._gaps(x1, n + 1)
-            new = (self.after < -tol) & ~known
-            left = self.planes.left(rows, n, x0, x1, self.gaps, self.after)
-            reached = np.abs(left)[pressed].max(initial=0.0)
-            if self.after.min() >= -tol and reached <= tol:
+            x1, left = self._end(rows, n, x0)
+            if self._reached(left[pressed]) <= tol and midpoint.balance():
+                x1, left = self._end(rows, n, x0)
+            if self._reached(left[pressed]) <= tol:
                 return f, rows.take(pressed)
-            known |= new
+            known |= self.after < -tol
             self.planes.keep(rows, np.where(pressed, np.abs(left), -left) > tol, count)
-        raise unsettled(max(float(reached), -float(self.after.min())))
+        raise unsettled(self._reached(left[pressed]))
+
+    def _end(self, rows: Rows, n: int, x0: Array) -> tuple[Array, Array]:
+        """Boundary nodes at the end of a step, (p, d), and gaps of rows there, (k,) [m]; sets ``after``. Collective."""
+        x1 = x0 + self._way(n)
+        self.after = self._gaps(x1, n + 1)
+        return x1, self.planes.left(rows, n, x0, x1, self.gaps, self.after)
+
+    def _reached(self, left: Array) -> float:
+        """Largest depth of any node, or gap ``left`` of a pressed one [m]."""
+        return float(max(np.abs(left).max(initial=0.0), -self.after.min()))
 
     def _strengths(self, rows: Rows, m: int) -> Array:
         """Strengths (m,) of the responses in the forces of rows."""

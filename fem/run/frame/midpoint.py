@@ -293,7 +293,7 @@ class LinearTurningStep(TurningStep):
         """There is one factor."""
         return False
 
-    def _find(self, guess: Array, least: int = 0) -> Root:
+    def _find(self, guess: Array, balanced: bool = True) -> Root:
         target = max(self.tol * self.counts.scale, 8 * self.body.rounding)
         root: Root = self.newton.find(guess, target)
         self.last = root.norm / self.counts.scale if self.counts.scale > 0 else 0.0
