@@ -16,9 +16,10 @@ COPY_BYTES = (
 )
 LU_BYTES = 20.0  # of an entry of a complex factor: 16 and an index
 # Whole factors at a time in a rank's memory over one: measured 2.1, 2.4 and 2.0 on two ranks with 1e5 and 1.5e4
-# unknowns in 2D and 1e4 in 3D; on one rank whose threads make the next factors 5.1 with 1e5 in 2D, 7.7 with 1e4 in 3D.
+# unknowns in 2D and 1e4 in 3D; on one rank whose threads make the next factors 5.1 with 1e5 in 2D, and in 3D 4.7 with
+# 2.1e4, and 7.7 with 1e4, where it is small.
 HELD = 2.4
-HELD_AHEAD = {2: 5.1, 3: 7.7}
+HELD_AHEAD = {2: 5.1, 3: 5.0}
 
 
 def gathered_bytes(n: int, dimension: int, order: int, ahead: bool) -> float:
