@@ -23,7 +23,7 @@ RUN = ("time.steps=200", "time.end=1.0")
 TABLE = "{kind='halfspace', normal=[0, 1], offset=-0.03}"
 STIFF = 20.0  # of the textbook's springs over Young's modulus [m]: stiffer ones blow up
 FALL = 0.3  # energy by which the body falls 3 cm [J]
-BOUND = 1e-11
+BOUND = 1e-12
 REASON = (
     "rounding: a gap is met to 64 units of the coordinates, 1.4e-14 of the size, and the balance sums some units of "
     "the largest energy a step"
