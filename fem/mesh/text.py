@@ -48,7 +48,15 @@ def read_text(path: Path) -> meshio.Mesh | None:
             return None
         # what is not written as usual fails in many ways, and the tables of meshio that are used here are not public
         with contextlib.suppress(
-            _UnusualError, LookupError, ValueError, RuntimeError, OSError, ImportError, MemoryError, meshio.ReadError
+            _UnusualError,
+            LookupError,
+            ValueError,
+            ArithmeticError,
+            RuntimeError,
+            OSError,
+            ImportError,
+            MemoryError,
+            meshio.ReadError,
         ):
             text: Text = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
             return read(text if text[-1:] == b"\n" else text[:])  # a byte may be looked at behind the last one

@@ -30,7 +30,7 @@ INDEFINITE = "cholesky: the factorisation of the tissue matrix failed; it is not
 
 
 class NoEntries(Exception):
-    """PETSc does not show the entries of a factor."""
+    """PETSc does not show the entries of a factor, or some rank has none."""
 
 
 class SplitFactor:
@@ -61,6 +61,8 @@ class SplitFactor:
         sigma[self.mine] = rows[self.own][:, G].toarray()
         sigma, at = total(self.comm, sigma), np.ix_(self.touched, self.touched)
         with raise_on_all_ranks(self.comm):
+            if not len(inner):
+                raise NoEntries
             parts = rows[self.inner][:, self.inner + first * d], outer[:, self.touched]
             self.ksp = _factored(_bordered(*parts, sigma[at]), prefix, d)
             self.factor = self.ksp.getPC().getFactorMatrix()
@@ -101,7 +103,7 @@ class SplitFactor:
 def split_factor(S: PETSc.Mat, prefix: str, d: int) -> SplitFactor | None:
     """The factor with a subtree on each rank; None where the user gave options, or blocks lose digits. Collective.
 
-    None too where PETSc does not show what it stores of a factor.
+    None too where PETSc does not show what it stores of a factor, and where some rank has no inner nodes.
 
     Raises SolverError: S is not definite; it is freed.
     """

@@ -243,7 +243,14 @@ def test_meshio_reads_without_a_compiler(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("name", ["a.inp", "a.msh"])
-@pytest.mark.parametrize("text", ["", "*NODE", ABAQUS.replace("3, 7", "3, 8"), GMSH.replace("9\n5", "9\n"), GMSH + "x"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "*NODE", ABAQUS.replace("3, 7", "3, 8"), GMSH.replace("9\n5", "9\n"), GMSH + "x"),
+        ABAQUS.replace("5, 9, 1", " 5, 9, 99999999999999999999"),
+        ABAQUS.replace("5, 9, 1", "5, 9, 0"),
+    ],
+)
 def test_wrong_files_end_in_the_sentence_of_meshio(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str
 ) -> None:

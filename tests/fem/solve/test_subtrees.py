@@ -51,6 +51,20 @@ def test_solves_agree_with_a_dense_solve(comm: MPI.Intracomm, name: str) -> None
     solver.destroy()
 
 
+def test_where_a_rank_has_nothing_to_eliminate_each_has_the_whole_factor(comm: MPI.Intracomm) -> None:
+    system = build(make_scene({"tissue": {"cells": [1, 2]}}), comm=comm).system
+    layout, S = system.layout, midpoint_matrix(system, 0.01)
+    dense = gather_matrix(layout, S).toarray()
+    solver = make_solver(S, "cholesky", layout, "test_", subtrees=True)
+    assert isinstance(solver.factor, OrderedFactor)
+    r, w = S.createVecs()
+    full = np.ones(layout.n_e)
+    r.array_w[:] = local_rows(layout, full)
+    solver.solve(r, w)
+    assert close(gather_rows(layout, w.array_r), np.linalg.solve(dense, full)) < 1e-12  # as above
+    solver.destroy()
+
+
 def test_each_rank_has_the_entries_of_its_part(comm: MPI.Intracomm) -> None:
     system = build(make_scene({"tissue": {"cells": [20, 40]}}), comm=comm).system
     whole, split = (
