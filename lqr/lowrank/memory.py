@@ -11,9 +11,8 @@ from softgrasp.fem.resources import free_memory
 from softgrasp.fem.solve.costs import ENTRIES
 from softgrasp.lqr.plant.checks import MODAL_KEY
 
-COPY_BYTES = (
-    52.0  # of whole K, M and S(p) in a rank's memory, an entry of K: 50 to 55 in 2D, 47 to 51 in 3D on two ranks
-)
+# Of whole K, M and S(p) in a rank's memory, an entry of K: 50 to 55 in 2D, 47 to 51 in 3D on two ranks.
+COPY_BYTES = 52.0
 LU_BYTES = 20.0  # of an entry of a complex factor: 16 and an index
 # Whole factors at a time in a rank's memory over one: measured 2.1, 2.4 and 2.0 on two ranks with 1e5 and 1.5e4
 # unknowns in 2D and 1e4 in 3D; on one rank whose threads make the next factors 5.1 with 1e5 in 2D, and in 3D 4.7 with
