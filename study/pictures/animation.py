@@ -16,7 +16,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from softgrasp.fem import Array, PictureMesh, note
-from softgrasp.fem.run.states.snapshots import FILMED
+from softgrasp.fem.run.states.snapshots import FILMED, spread
 from softgrasp.study.pictures import body
 from softgrasp.study.pictures.plate import around_bodies
 from softgrasp.study.pictures.shapes import speed_up
@@ -63,7 +63,7 @@ def move_bytes(
 
 def timing(times: Array) -> tuple[list[int], list[int]]:
     """Frames to show, at most 60, and how long each [ms]; rounding errors do not add up, and the last stays longer."""
-    chosen = np.unique(np.linspace(0, len(times) - 1, min(len(times), FILMED)).round().astype(int)).tolist()
+    chosen = spread(len(times), FILMED).tolist()
     at = np.round(100 * (times - times[0]) / speed_up(times)).astype(int)  # GIF counts in hundredths of a second
     kept = chosen[:1]
     for i in chosen[1:]:
