@@ -116,7 +116,8 @@ def shared[T](
     """Results of the calls ``own``, then of ``beside``, which a forked process begins with. Not collective.
 
     Whoever is done with its calls goes on with those of the other from their end, so that both end at about the same
-    time on whatever cores. Without another process, see :func:`forked`, or where it is lost, this one makes all.
+    time on whatever cores. Without another process, see :func:`forked`, or where it is lost, this one makes all; so it
+    does where they are more than a pipe holds bytes.
 
     ``same``: objects in the results that need not or cannot be packed.
 
@@ -124,14 +125,15 @@ def shared[T](
     """
     calls = [*own, *reversed(beside)]
     left, put = os.pipe()  # a byte for each call that nobody has begun; both take from opposite ends
-    os.write(put, bytes(len(calls)))
+    os.set_blocking(put, False)
+    fits = os.write(put, bytes(len(calls))) == len(calls)  # 65 536 do on Linux
     os.close(put)
 
     def made(order: Iterable[int]) -> dict[int, T]:
         return {i: calls[i]() for i in order if os.read(left, 1)}
 
     try:
-        other = forked(lambda pause: made(reversed(range(len(calls)))), same) if own and beside else None
+        other = forked(lambda pause: made(reversed(range(len(calls)))), same) if fits and own and beside else None
         with other or nullcontext():
             found = made(range(len(calls)))
             if other is not None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import PETSc, from_options, rows_on_all, to_scipy, user_options
+from softgrasp.fem.solve.entries import definite
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,7 @@ def factor_blocks(P: PETSc.Mat, prefix: str, entries: Literal["petsc", "mumps"] 
         entries: who factors single entries where blocks are not stable, or where the user gave options for the prefix,
             which PETSc serves for single entries only.
 
-    Raises SolverError: a pivot vanishes, or PETSc gives up.
+    Raises SolverError: a pivot vanishes or is negative, so that P is not definite, or PETSc gives up.
     """
     if not user_options(prefix):
         ksp = make_ksp(P.convert("sbaij", PETSc.Mat()), prefix)
@@ -267,7 +268,7 @@ def direct_solves(ksp: PETSc.KSP) -> PETSc.Mat | AskedSolver:
 
 
 def _factored(ksp: PETSc.KSP) -> bool:
-    """Make the factor; whether no pivot vanished."""
+    """Make the factor; whether no pivot vanished or is negative. PETSc passes over negative ones."""
     try:
         ksp.setUp()
     except PETSc.Error as error:
@@ -277,7 +278,9 @@ def _factored(ksp: PETSc.KSP) -> bool:
             f"cholesky: PETSc gave up the factorisation of the tissue matrix with error {error.ierr} (55 is out of "
             "memory); try time.solver = 'mumps' or fewer ranks"
         ) from error
-    return not ksp.getPC().getFailedReason()
+    pc = ksp.getPC()
+    asked = pc.getType() == "lu" or not is_factor(pc)
+    return not pc.getFailedReason() and (asked or definite(pc.getFactorMatrix()))
 
 
 class OrderedFactor:

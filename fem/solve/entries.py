@@ -25,6 +25,21 @@ def stored(factor: PETSc.Mat, blocks: int) -> Array | None:
     return np.ctypeslib.as_array(entries, (blocks, d, d))
 
 
+def definite(factor: PETSc.Mat) -> bool:
+    """Whether no pivot of Cholesky is negative, as where S > 0 (Sylvester); True where PETSc does not show them."""
+    if factor.getType() == "mumps":
+        return bool(factor.getMumpsInfog(12) == 0)
+    if factor.getType() != "seqsbaij":
+        return True
+    if (d := factor.getBlockSize()) == 1:
+        return bool(factor.getInertia()[0] == 0)
+    inverse = stored(factor, factor.getSize()[0] // d)
+    try:
+        return inverse is None or np.linalg.cholesky(inverse) is not None
+    except np.linalg.LinAlgError:
+        return False
+
+
 def last_rows(factor: PETSc.Mat, k: int) -> tuple[Array, Array] | None:
     """U and D of the last k nodes, dense, (k d, k d); None without access to them.
 

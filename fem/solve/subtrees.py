@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.petsc import Array, PETSc, to_scipy, total, user_options
 from softgrasp.fem.solve.cholesky import BACKWARD_ERROR, backward_error, make_ksp, nested_dissection, rows_of
-from softgrasp.fem.solve.entries import last_rows
+from softgrasp.fem.solve.entries import definite, last_rows
 
 INDEFINITE = "cholesky: the factorisation of the tissue matrix failed; it is not definite: check material and mesh"
 
 
 class NoEntries(Exception):
-    """PETSc does not show the entries of a factor, or some rank has none."""
+    """PETSc does not show the entries of a factor, or some rank has none, or they are of no definite matrix."""
 
 
 class SplitFactor:
@@ -170,6 +170,9 @@ def _factored(A: Any, prefix: str, d: int) -> PETSc.KSP:
     ksp = make_ksp(P.convert("sbaij", PETSc.Mat()), prefix)
     P.destroy()
     ksp.setUp()
-    if ksp.getPC().getFailedReason():
+    pc = ksp.getPC()
+    if pc.getFailedReason():
         raise SolverError(INDEFINITE)
+    if not definite(pc.getFactorMatrix()):  # by rounding too
+        raise NoEntries
     return ksp

@@ -96,7 +96,7 @@ def reduce_gains(
     n_s = design.problem.layout.n_s
     offered = range(2 * n_s + 2, fast_order(n_s) + 1)  # to the controller
     wanted: list[tuple[int, range | None]] = [] if offered_only else [(k, None) for k in range(len(best))]
-    return tuple(_examined(design, best, wanted + [(k, offered) for k, b in enumerate(best) if b.name == A_PRIORI]))
+    return tuple(certified(design, best, wanted + [(k, offered) for k, b in enumerate(best) if b.name == A_PRIORI]))
 
 
 def _ranked(design: Design, bases: Sequence[BasisGains]) -> list[BasisGains]:
@@ -113,18 +113,15 @@ def _ranked(design: Design, bases: Sequence[BasisGains]) -> list[BasisGains]:
     return [replace(b, reports=tuple(map(costs, b.reports))) for b in bases]
 
 
-def certified(design: Design, bases: Sequence[BasisGains], sizes: range | None = None) -> list[BasisGains]:
-    """The reduced gains, the best of every basis (or the next best) checked by the full plant's spectrum. Collective.
-
-    ``sizes``: orders of the gains that are offered; None for any.
-    """
-    return _examined(design, bases, [(k, sizes) for k in range(len(bases))])
-
-
-def _examined(
+def certified(
     design: Design, bases: Sequence[BasisGains], wanted: Sequence[tuple[int, range | None]]
 ) -> list[BasisGains]:
-    """The same for pairs of a basis and orders, the first gains of all pairs together. Collective."""
+    """The reduced gains, the cheapest of each pair checked by the full plant's spectrum, or the next. Collective.
+
+    Args:
+        wanted: pairs of the place of a basis and the orders that are offered, None for any; those checked first of all
+            pairs are checked together.
+    """
     reports = [list(b.reports) for b in bases]
     queues = []
     for k, sizes in wanted:

@@ -210,8 +210,16 @@ class OpenLoop:
         subtrees = not factor_on_every_rank(self.layout, name, "auto", linear=True)
         S = dynamic_stiffness(self.system, shift)
         self.solver = make_solver(S, name, self.layout, PREFIX, rtol=1e-12, subtrees=subtrees)
-        system, sigma, n_s = self.system, shift, self.layout.n_s
-        hand = sigma**2 * problem.M_s
+        try:
+            self._couple(shift)
+        except Exception:
+            self.destroy()
+            raise
+
+    def _couple(self, sigma: float) -> None:
+        """The hand's part, and the columns. Collective."""
+        system, n_s = self.system, self.layout.n_s
+        hand = sigma**2 * self.problem.M_s
         if system.two_way:
             self.S_G = self.solver.columns(system.G)
             factor = sigma**2 + sigma * self.drag

@@ -220,7 +220,8 @@ def retune(
     """
     layout = design.problem.layout
     reason = outside(design.model)
-    chosen = [] if reason else re_tunable(certified(design, bases, range(fast_order(layout.n_s) + 1)), layout.n_s)
+    offered = [(k, range(fast_order(layout.n_s) + 1)) for k in range(len(bases))]
+    chosen = [] if reason else re_tunable(certified(design, bases, offered), layout.n_s)
     if not reason and layout.states > BOX_STATES:
         reason = (
             f"{layout.states} states are more than {BOX_STATES}: the full solutions to compare with would take long"

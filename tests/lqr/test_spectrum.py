@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.solve import costs
+from softgrasp.fem.solve.solvers import TissueSolver
 from softgrasp.fem.solve.stiffness import sharing_factors
 from softgrasp.fem.solve.subtrees import SplitFactor
 from softgrasp.lqr.design.scene import problem as make_problem
@@ -164,6 +166,24 @@ def test_gains_of_one_circle_share_a_factor(monkeypatch: pytest.MonkeyPatch) -> 
     alone = [abscissa(problem, K) for K in gains]
     assert len(made) == 3
     assert [a.value for a in alone] == [a.value for a in shared]
+
+
+@pytest.mark.ranks
+def test_a_plant_whose_solves_fail_keeps_no_factor(monkeypatch: pytest.MonkeyPatch) -> None:
+    freed, free = list[TissueSolver](), TissueSolver.destroy
+
+    def fails(*_: Any) -> Any:
+        raise SolverError("mumps: no solve")
+
+    def destroy(self: TissueSolver) -> None:
+        freed.append(self)
+        free(self)
+
+    monkeypatch.setattr(TissueSolver, "columns", fails)
+    monkeypatch.setattr(TissueSolver, "destroy", destroy)
+    with pytest.raises(SolverError, match="no solve"):
+        OpenLoop(small(KELVIN), 1.0)
+    assert len(freed) == 1
 
 
 @pytest.mark.ranks(3)

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.solve.cholesky import factor_blocks
 from softgrasp.fem.solve.entries import last_rows, stored
+
+
+def in_blocks(A: Array, d: int) -> PETSc.Mat:
+    P = PETSc.Mat().createDense(A.shape, array=np.asfortranarray(A), comm=PETSc.COMM_SELF).convert("aij")
+    P.setBlockSizes(d, d)
+    P.setOption(PETSc.Mat.Option.SPD, True)
+    return P.convert("baij", PETSc.Mat())
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -19,10 +29,7 @@ def test_the_last_rows_of_a_factor_are_those_of_the_schur_complement(d: int) -> 
         S[i, :, j], S[j, :, i] = (block := rng.standard_normal((d, d))), block.T
     A = S.reshape(nodes * d, -1)
     A += np.diag(1 + np.abs(A).sum(axis=1))
-    P = PETSc.Mat().createDense(A.shape, array=np.asfortranarray(A), comm=PETSc.COMM_SELF).convert("aij")
-    P.setBlockSizes(d, d)
-    P.setOption(PETSc.Mat.Option.SPD, True)
-    ksp = factor_blocks(P.convert("baij", PETSc.Mat()), "test_")
+    ksp = factor_blocks(in_blocks(A, d), "test_")
     factor, first = ksp.getPC().getFactorMatrix(), (nodes - k) * d
     assert factor.getType() == "seqsbaij"
     found = last_rows(factor, k)
@@ -36,3 +43,22 @@ def test_the_last_rows_of_a_factor_are_those_of_the_schur_complement(d: int) -> 
     assert inverse is not None
     assert np.abs(inverse[0] @ A[:d, :d] - np.eye(d)).max() < 1e-14  # one block
     ksp.destroy()
+
+
+@pytest.mark.parametrize("entries", ["petsc", "mumps"])
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_a_matrix_is_refused_where_one_eigenvalue_is_negative(d: int, entries: Any) -> None:
+    """Wherever in the order of elimination the negative pivot comes."""
+    rng = np.random.default_rng(d)
+    for negative in [*range(4), 0] * 3:
+        B = rng.standard_normal((6 * d, 6 * d))
+        values, vectors = np.linalg.eigh(B + B.T)
+        shift = values[0] - 1.0 if negative == 0 else values[negative - 1 : negative + 1].mean()
+        A = (vectors * (values - shift)) @ vectors.T
+        A = (A + A.T) / 2
+        assert np.sum(np.linalg.eigvalsh(A) < 0) == negative
+        if negative:
+            with pytest.raises(SolverError, match="not definite"):
+                factor_blocks(in_blocks(A, d), "test_", entries)
+        else:
+            factor_blocks(in_blocks(A, d), "test_", entries).destroy()
