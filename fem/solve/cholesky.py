@@ -114,25 +114,28 @@ EVERY_LEVEL = 2**31 - 1  # levels of fill of an incomplete factor that is comple
 VANISHING_PIVOT = (71, 81)  # PETSC_ERR_MAT_LU_ZRPVT, PETSC_ERR_MAT_CH_ZRPVT
 
 
-def factor_blocks(P: PETSc.Mat, prefix: str, entries: Literal["petsc", "mumps"] = "petsc") -> PETSc.KSP:
+def factor_blocks(
+    P: PETSc.Mat, prefix: str, entries: Literal["petsc", "mumps"] = "petsc", tangent: bool = False
+) -> PETSc.KSP:
     """Factor P = P' > 0 in the order of its rows, in blocks where that is stable.
 
     Args:
         P: the matrix in blocks of d x d (BAIJ), on this rank alone.
         entries: who factors single entries where blocks are not stable, or where the user gave options for the prefix,
             which PETSc serves for single entries only.
+        tangent: P may be indefinite.
 
-    Raises SolverError: a pivot vanishes or is negative, so that P is not definite, or PETSc gives up.
+    Raises SolverError: a pivot vanishes or is negative, or PETSc gives up.
     """
     if not user_options(prefix):
         ksp = make_ksp(P.convert("sbaij", PETSc.Mat()), prefix)
-        if _factored(ksp) and (P.getBlockSize() == 1 or backward_error(P, ksp) <= BACKWARD_ERROR):
+        if make_factor(ksp, tangent) and (P.getBlockSize() == 1 or backward_error(P, ksp) <= BACKWARD_ERROR):
             return ksp
         ksp.destroy()
     single = P.convert("aij", PETSc.Mat())
     single.setOption(PETSc.Mat.Option.SPD, True)
     ksp = make_ksp(single, prefix, entries)
-    if not _factored(ksp):
+    if not make_factor(ksp, tangent):
         ksp.destroy()
         raise SolverError(
             f"cholesky: the factorisation of the tissue matrix (n_e = {P.getSize()[0]}) failed; the matrix is singular "
@@ -267,8 +270,11 @@ def direct_solves(ksp: PETSc.KSP) -> PETSc.Mat | AskedSolver:
     return AskedSolver(ksp) if user_options(ksp.getOptionsPrefix()) else ksp.getPC().getFactorMatrix()
 
 
-def _factored(ksp: PETSc.KSP) -> bool:
-    """Make the factor; whether no pivot vanished or is negative. PETSc passes over negative ones."""
+def make_factor(ksp: PETSc.KSP, tangent: bool) -> bool:
+    """Make the factor; whether no pivot vanished, nor is negative but in that of a tangent. Collective where ksp is.
+
+    PETSc and MUMPS pass over negative ones. Raises SolverError: PETSc gives up.
+    """
     try:
         ksp.setUp()
     except PETSc.Error as error:
@@ -279,8 +285,8 @@ def _factored(ksp: PETSc.KSP) -> bool:
             "memory); try time.solver = 'mumps' or fewer ranks"
         ) from error
     pc = ksp.getPC()
-    asked = pc.getType() == "lu" or not is_factor(pc)
-    return not pc.getFailedReason() and (asked or definite(pc.getFactorMatrix()))
+    free = tangent or pc.getType() == "lu" or not is_factor(pc)
+    return not pc.getFailedReason() and (free or definite(pc.getFactorMatrix()))
 
 
 class OrderedFactor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from softgrasp.fem.errors import SolverError, raise_on_all_ranks
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, from_options, petsc_options, total, user_options, whole_copy
 from softgrasp.fem.solve.cholesky import (
-    VANISHING_PIVOT,
     AskedSolver,
     NodeOrder,
     OrderedFactor,
@@ -21,6 +20,7 @@ from softgrasp.fem.solve.cholesky import (
     dissect,
     factor_blocks,
     is_factor,
+    make_factor,
     make_ksp,
     package_of,
     solve_checked,
@@ -229,13 +229,7 @@ class TissueSolver:
         else:
             A.copy(P, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         self.ksp.setOperators(P)  # else PETSc does not see that the numbers changed
-        try:
-            self.ksp.setUp()
-        except PETSc.Error as error:
-            if error.ierr in VANISHING_PIVOT:
-                return False
-            raise
-        return not self.ksp.getPC().getFailedReason()
+        return make_factor(self.ksp, tangent=True)
 
     def destroy(self) -> None:
         """Free solver and matrix. Collective."""
@@ -257,6 +251,7 @@ def make_solver(
     reproducible: Reproducible = "auto",
     ordered: bool = False,
     subtrees: bool = False,
+    tangent: bool = False,
 ) -> TissueSolver:
     """Factor S (or set up CG with GAMG). Collective.
 
@@ -267,6 +262,7 @@ def make_solver(
         reproducible: see :func:`factor_on_every_rank`.
         ordered: cholesky, S on one rank: its rows are in the order of elimination already, in blocks (BAIJ).
         subtrees: cholesky: a subtree on each rank, if blocks keep the digits and the user gave no options.
+        tangent: cholesky: S may be indefinite, as on the way of Newton's method.
 
     Raises SolverError: the factorisation fails.
     """
@@ -275,7 +271,7 @@ def make_solver(
     if name == "cholesky":
         if subtrees and (split := split_factor(S, prefix, layout.dimension)) is not None:
             return TissueSolver(name, split.ksp, S, tolerance, split)
-        return _cholesky(S, layout, prefix, tolerance, ordered)
+        return _cholesky(S, layout, prefix, tolerance, ordered, tangent)
     if name == "stars":
         return _stars(S, layout, prefix, rtol, tolerance)
     if name == "mumps" and S.comm.size > 1 and factor_on_every_rank(layout, name, reproducible):
@@ -323,7 +319,9 @@ def _gathered(ksp: PETSc.KSP, order: NodeOrder, S: PETSc.Mat) -> OrderedFactor:
     return factor
 
 
-def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, ordered: bool) -> TissueSolver:
+def _cholesky(
+    S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, ordered: bool, tangent: bool
+) -> TissueSolver:
     """Every rank factors the whole matrix. Collective."""
     P, order = S, None
     if not ordered:
@@ -333,7 +331,8 @@ def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, 
         every.destroy()
     try:
         with raise_on_all_ranks(S.comm.tompi4py()):
-            ksp = factor_blocks(P, prefix, "petsc" if layout.n_e <= FEW_LIMIT[layout.dimension] else "mumps")
+            by: Literal["petsc", "mumps"] = "petsc" if layout.n_e <= FEW_LIMIT[layout.dimension] else "mumps"
+            ksp = factor_blocks(P, prefix, by, tangent)
     except SolverError:
         S.destroy()
         raise

@@ -170,7 +170,7 @@ def _newton(
         for _ in range(MOST):
             if norm <= target:
                 return True
-            tangent = make_solver(body.tangent(z).copy(), name, system.layout, "softgrasp_static_")
+            tangent = make_solver(body.tangent(z).copy(), name, system.layout, "softgrasp_static_", tangent=True)
             residual(z)
             tangent.solve(f, p)
             tangent.destroy()
