@@ -11,6 +11,7 @@ import scipy.sparse
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.assembly import Discretisation
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.points import Parts, facet_points
@@ -83,3 +84,18 @@ def make_surface(space: Discretisation, system: BlockSystem, parts: Parts | None
         B = scipy.sparse.vstack([scipy.sparse.eye_array(len(X)), B], format="csr") if len(places) else None
         X, T = np.vstack([X, places]), np.vstack([T, modes])
     return Surface(layout.comm, X, T, dofs, mine, rows, B)
+
+
+def contains(space: Discretisation, points: Array) -> NDArray[np.bool_]:
+    """Whether a cell of the body at rest contains each of a few points (k, d) [m], on every rank. Collective."""
+    d, mesh = space.mesh.dimension, space.V.mesh
+    corners = mesh.geometry.x[cell_nodes(mesh), :d]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    found = np.zeros(len(points), dtype=bool)
+    for i, point in enumerate(points):
+        near = corners[((low <= point) & (point <= high)).all(axis=1)]
+        edges = (near[:, 1:] - near[:, :1]).transpose(0, 2, 1)
+        shares = np.linalg.solve(edges, (point - near[:, 0])[:, :, None])[:, :, 0]
+        found[i] = ((shares >= 0).all(axis=1) & (shares.sum(axis=1) <= 1)).any()
+    space.layout.comm.Allreduce(MPI.IN_PLACE, found, MPI.LOR)
+    return found

@@ -38,6 +38,10 @@ class Shape(ABC):
     def size(self) -> float:
         """Radius of a ball, else the least distance of a face from the farthest corner [m], infinite without one."""
 
+    def middle(self) -> Array | None:
+        """A point within (d,) [m]; None for a half-space."""
+        return None
+
 
 @dataclass(frozen=True)
 class HalfSpace(Shape):
@@ -83,6 +87,10 @@ class Ball(Shape):
     def size(self) -> float:
         """See :meth:`Shape.size`."""
         return self.radius
+
+    def middle(self) -> Array:
+        """See :meth:`Shape.middle`."""
+        return self.center
 
 
 @dataclass(frozen=True)
@@ -148,3 +156,7 @@ class Polytope(Shape):
     def size(self) -> float:
         """See :meth:`Shape.size`."""
         return float((self.offsets - (self.corners @ self.normals.T).min(axis=0)).min())
+
+    def middle(self) -> Array:
+        """See :meth:`Shape.middle`."""
+        return np.asarray(self.corners.mean(axis=0))

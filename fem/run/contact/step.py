@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.surface import contains
 from softgrasp.fem.obstacles.compiled import contact_library
+from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.contact.flat import FlatContact
 from softgrasp.fem.run.contact.general import Contact
 from softgrasp.fem.run.contact.touching import Touching
@@ -51,13 +56,31 @@ def make_contact(
 ) -> tuple[ContactDrive, Contact]:
     """The contact of a run, and its drive with it. Collective.
 
-    Raises SoftgraspError: a path of an obstacle does not fit, or the prescribed hand itself meets an obstacle.
+    Raises SoftgraspError: a path of an obstacle does not fit, or an obstacle is in the tissue or meets the hand.
     """
     hand = drive.step if isinstance(drive, ForceDrive) and model.system.two_way else None
     contact = begin_contact(model, midpoint, steps, hand)
     if isinstance(drive, TableDrive):
         contact.check_hand(drive.q, 0, steps + 1)
+    _refuse_within(model, contact, drive.q[0])
     return ContactDrive(drive, contact), contact
+
+
+def _refuse_within(model: Model, contact: Contact, q: Array) -> None:
+    """Refuse an obstacle that the boundary with the hand at q (n_s,) goes round, which nothing can touch. Collective.
+
+    Raises SceneError: there is one.
+    """
+    middles = [(o, x + o.shift(0.0)) for o in contact.obstacles if (x := o.shape.middle()) is not None]
+    if not middles:
+        return
+    within = contains(model.space, np.array([x for _, x in middles]) - q[: contact.d])
+    boundary = contact.surface.places(q)
+    for (o, _), inside in zip(middles, within, strict=True):
+        if inside and o.gap(boundary).min() > 0:
+            raise SceneError(
+                f"obstacle '{o.name}' lies within the tissue at the start, out of reach of its boundary; move it"
+            )
 
 
 def begin_contact(model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> Contact:
