@@ -177,7 +177,7 @@ def _apply(data: dict[str, Any], override: str) -> None:
 def _child(node: Any, part: str, override: str, path: str) -> Any:
     child = node[_index(node, part, override)] if isinstance(node, list) else node.setdefault(part, {})
     if not isinstance(child, dict | list):
-        raise SceneError(f"--set {shortened(override)}: {path} is {_show(child)}, no table; set {path} itself")
+        raise SceneError(f"--set {shortened(override)}: {path} is {_show(child)}, which has no keys; set {path} itself")
     return child
 
 
@@ -238,7 +238,7 @@ def _explain(error: ValidationError, data: dict[str, Any]) -> str:
     meant = [key for key in missing if any(text.endswith(f"did you mean {key}?") for text in misspelled)]
     first = next(iter(misspelled or problems.values()))
     more = len(problems) - len(meant) - 1
-    return first + (f"; and {more} more" if more else "")
+    return first + (f"; {more} more key{'s are' if more > 1 else ' is'} wrong or missing" if more else "")
 
 
 def _show(value: Any) -> str:

@@ -110,7 +110,10 @@ def find_method(name: str) -> Method:
     """Look a basis up. Raises BasisError: there is none of this name."""
     known = METHODS | OWN_METHODS
     if name not in known:
-        raise BasisError(f"basis '{name}' is unknown; choose one of {', '.join(known)}")
+        some = dict.fromkeys((*PAPER_METHODS, "psd_svd_like", "craig_bampton", *OWN_METHODS))
+        raise BasisError(
+            f"basis '{name}' is unknown; choose one of {', '.join(some)}, or another key of softgrasp.reduction.METHODS"
+        )
     return known[name]
 
 

@@ -232,8 +232,8 @@ def contact_rows(contact: ContactRecord) -> list[tuple[str, str]]:
         rows.append(("all obstacles", f"force ({force}) N at the end"))
     taken = f"{contact.touch:.3g} J at first touch, {contact.stopped:.3g} J by impulses"
     taken += f", {contact.rubbed:.3g} J by friction" if contact.rubbed else ""
-    taken += f"; deepest penetration {contact.penetration:.1e} m, chatter {contact.chatter}"
-    return [*rows, ("dissipated by contact", taken)]
+    kept = f"{contact.penetration:.1e} m, {contact.chatter}"
+    return [*rows, ("dissipated by contact", taken), ("deepest penetration, chatter", kept)]
 
 
 def newton_keys(newton: NewtonFigures) -> dict[str, float]:

@@ -40,7 +40,7 @@ CAPTIONS = {
     "move.png": "The body at some instants of the move.",
     "move.gif": "",
     "mesh_error.png": "Outputs relative to the hand on this mesh and corrected, with the band of the error bound.",
-    "contact.png": "Length of the force of each obstacle, its least gap, and how many nodes it presses. Bold: mean "
+    "contact.png": "Force of each obstacle (its magnitude), its least gap, and how many nodes it presses. Bold: mean "
     "force of two steps; thin: of each step.",
     "traces.png": "Hand and outputs against time; below, the outputs relative to the hand.",
 }

@@ -40,6 +40,7 @@ WORDS = {  # what short words mean; a page lists those that it uses
     "2n": "states of the full model: positions and velocities of hand and tissue, 2 (n_s + n_e)",
     "gate": "the number that decides whether an effect matters: above the stated value it does",
     "energy drift": "change of the energy that no work or damping explains, over the largest energy of the run",
+    "chatter": "how often a node begins or ends to touch in one step and takes it back in the next",
     "residual": "what is left of an equation when its solution is put in, relative to its terms",
     "abscissa": "largest real part of the poles [1/s]; the motion decays where it is negative",
     "spectral radius": "largest modulus of the poles from tick to tick; the sampled motion decays where it is below 1",

@@ -16,10 +16,6 @@ from softgrasp.study.report import Section, Table, captioned, in_words, percent
 from softgrasp.study.report.document import number
 
 CAPTIONS = {
-    "obstacle.png": "The boundary of the body on the full plant under the plan, and the way of its middle; grey and "
-    "dashed: under the optimal feedback, which has no obstacles, where it is deepest inside. A body in space is seen "
-    "from the front and from above, where outlines may cross and nothing touches. Dots: the nodes that keep gaps, "
-    "where they are not the whole boundary. What moves is drawn at the same instants.",
     "gaps.png": "Gap of the body to every obstacle on the full plant, with a band of three standard deviations where "
     "an observer keeps it on its way under noise. Dashed: clearance and margins, which the reduced plant keeps; the "
     "full plant may use the margins up. Where control.constraints.body gives nodes, gaps are theirs. Below: force "
@@ -41,7 +37,7 @@ def plan_sections(study: PlannedStudy, drawn: Sequence[Path]) -> list[Section]:
             runs.free.least.tolist(), strict=True,
         )
     ]  # fmt: skip
-    figures = captioned(drawn, CAPTIONS)
+    figures = captioned(drawn, CAPTIONS | {"obstacle.png": _way(study)})
     way = [each for each in figures if each[0].name == "obstacle.png"]
     others = [each for each in figures if each not in way]
     parts = [Section("", figures=way), Section("Plan", rows=facts(study), figures=others, terminal=True)]
@@ -52,6 +48,22 @@ def plan_sections(study: PlannedStudy, drawn: Sequence[Path]) -> list[Section]:
         )
         parts.append(Section("Gaps", text, header=GAPS, rows=gaps, terminal=True))
     return parts
+
+
+def _way(study: PlannedStudy) -> str:
+    """What the picture of the way past the obstacles shows."""
+    task = study.planned.plan.task
+    text = (
+        "The boundary of the body on the full plant under the plan at some instants, and the way of its middle; grey "
+        "and dashed: under the optimal feedback, which knows no obstacles, where it is deepest inside."
+    )
+    if study.planned.runs.planned.body.shape[-1] == 3:
+        text += " It is seen from the front and from above, where outlines may cross and nothing touches."
+    if study.named is not None:
+        text += " Dots: the nodes that keep gaps."
+    if any(task.path(i) is not None for i in range(len(task.shapes))):
+        text += " Obstacles that move are drawn at the same instants."
+    return text
 
 
 def plan_table(study: PlannedStudy) -> Table:

@@ -94,7 +94,7 @@ def _motions(study: ContactStudy) -> Table:
     for motion in study.motions:
         z, force = motion.errors.get(study.best, (None, None))
         rows.append((
-            motion.title, ", ".join(f"{x:.3g}" for x in motion.target), percent(motion.touching), motion.force,
+            motion.title, ", ".join(f"{x + 0.0:.3g}" for x in motion.target), percent(motion.touching), motion.force,
             None if z is None else percent(z, digits=3), None if force is None else percent(force, digits=3),
         ))  # fmt: skip
     header = ("motion", "target [m]", "steps with contact", "largest force [N]", "z", "force")

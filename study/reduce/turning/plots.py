@@ -18,6 +18,6 @@ def draw(out: Path, points: Sequence[TurningPoint]) -> list[Path]:
         for name, colour in zip(dict.fromkeys(p.method for p in points), style.CYCLE, strict=False):
             of = [p for p in points if p.method == name]
             ax.semilogy([p.N for p in of], [max(p.error, 1e-8) for p in of], "o-", color=colour, ms=3.4, label=name)
-        ax.set(xlabel="N", ylabel="error of the deformation z [1]")
+        ax.set(xlabel="N, columns of the basis", ylabel="error of the deformation z [1]")
         ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(0.0, 1.0))
         return list(save(figure, out / "errors.png"))

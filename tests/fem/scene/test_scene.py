@@ -70,7 +70,7 @@ REFUSED: list[tuple[Path, list[str], str]] = [
     (
         PAPER,
         ["hand.mas=1", "time.steps=0", "hand.mass=-1"],
-        "hand.mas is not a key; did you mean hand.mass?; and 2 more",
+        "hand.mas is not a key; did you mean hand.mass?; 2 more keys are wrong or missing",
     ),
     # material
     (
@@ -157,7 +157,7 @@ REFUSED: list[tuple[Path, list[str], str]] = [
     (PAPER, ["hand..mass=1"], "it must read section.key=value"),
     (PAPER, ["hand.mass=1 2"], "'1 2' is not a TOML value"),
     (PAPER, ["hand.mass=1\nb = 2"], "it must have one value"),
-    (PAPER, ["hand.mass.kg=1"], "hand.mass is 20.0, no table; set hand.mass itself"),
+    (PAPER, ["hand.mass.kg=1"], "hand.mass is 20.0, which has no keys; set hand.mass itself"),
     (PAPER, ["control.outputs.1.name=a"], "'1' must be an index below 1"),
 ]
 
@@ -174,7 +174,9 @@ def test_refused_with_one_sentence(path: Path, overrides: list[str], sentence: s
     assert message.startswith((f"{path}: ", "--set "))
 
 
-@pytest.mark.parametrize(("value", "others"), [("{stepps=5}", ""), ("{stepps=5, end=0}", "; and 1 more")])
+@pytest.mark.parametrize(
+    ("value", "others"), [("{stepps=5}", ""), ("{stepps=5, end=0}", "; 1 more key is wrong or missing")]
+)
 def test_a_misspelled_key_is_not_missing_too(value: str, others: str) -> None:
     with pytest.raises(SceneError, match=re.escape(f"did you mean time.steps?{others}") + "$"):
         load_scene(PAPER, [f"time={value}"])
