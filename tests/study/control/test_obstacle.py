@@ -56,7 +56,7 @@ def test_page_files_and_numbers_agree(tmp_path: Path) -> None:
     for name in ("obstacle.png", "gaps.png", "times.png"):
         assert (tmp_path / name).stat().st_size > 10_000
     page = (tmp_path / "report.html").read_text()
-    assert "has no obstacles" in page
+    assert "knows no obstacles" in page
 
 
 def test_page_of_named_nodes_speaks_of_them_alone(tmp_path: Path) -> None:
