@@ -11,7 +11,7 @@ import scipy.linalg
 from mpi4py import MPI
 from scipy.optimize import lsq_linear
 
-from softgrasp.fem.errors import Paused
+from softgrasp.fem.errors import Paused, SceneError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.obstacles.small import DependentProblem
 from softgrasp.fem.petsc import to_scipy
@@ -148,3 +148,12 @@ def test_ranks_agree(comm: MPI.Intracomm) -> None:
     )
     assert ours.contact.nodes == alone.contact.nodes
     assert np.abs(ours.outputs - alone.outputs).max() < 1e-9  # of a body of 2 m: rounding turns the normals of a pin
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize(
+    "within", ["kind='disc', center=[0.5, 1], radius=0.3", "kind='box', lo=[0.2, 1.6], hi=[0.3, 1.7]"]
+)
+def test_an_obstacle_that_no_point_can_touch_is_refused(within: str) -> None:
+    with pytest.raises(SceneError, match=r"obstacle '(disc|box)1' lies within the tissue at the start"):
+        run(f"obstacle=[{{{within}}}]")
