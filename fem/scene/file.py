@@ -238,7 +238,7 @@ def _explain(error: ValidationError, data: dict[str, Any]) -> str:
     meant = [key for key in missing if any(text.endswith(f"did you mean {key}?") for text in misspelled)]
     first = next(iter(misspelled or problems.values()))
     more = len(problems) - len(meant) - 1
-    return first + (f"; {more} more key{'s are' if more > 1 else ' is'} wrong or missing" if more else "")
+    return first + (f"; {more} more key{'s are' if more > 1 else ' is'} wrong" if more else "")
 
 
 def _show(value: Any) -> str:
