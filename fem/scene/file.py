@@ -332,7 +332,7 @@ def _purpose(path: Sequence[str]) -> str:
         return "give it"
     annotation, description = known[path[-1]]
     choices = _choices(annotation)
-    return f"give {description.removesuffix(' [no unit]')}: {', '.join(choices)}" if choices else f"give {description}"
+    return f"give {description.removesuffix(' [no unit]')}" + (f": {', '.join(choices)}" if choices else "")
 
 
 def _choices(annotation: Any) -> list[str]:
