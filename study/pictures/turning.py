@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -21,6 +20,11 @@ from softgrasp.study.pictures import shapes
 TEMPLATE = Path(__file__).with_name("turning.html")
 MOST_BYTES = 12_000_000  # of all coordinates in the page; above, instants are left out
 LEVELS = 65535  # steps of a coordinate over the largest side of the scene
+# of style.colour_map, at equal distances: pages do without Matplotlib
+COLOURS = (
+    "f1e51dd5e21ab2dd2d93d74175d0545ac86440bd722eb37c23a9831e9d89"
+    "20928c24868e297b8e2d708e32648e38588c3e4989443b84472d7b481d6f"
+)
 
 
 @dataclass(frozen=True)
@@ -78,8 +82,10 @@ def rendered(template: Path, data: dict[str, Any], **words: Any) -> str:
 
 
 def colours() -> npt.NDArray[np.uint8]:
-    """The 256 colours of a field, (256, 3)."""
-    return np.asarray(np.round(255 * mpl.colormaps["viridis"](np.linspace(0, 1, 256))[:, :3]).astype(np.uint8))
+    """The 256 colours of a field, those of pictures to 1 %, (256, 3)."""
+    given = np.frombuffer(bytes.fromhex(COLOURS), np.uint8).reshape(-1, 3)
+    x, at = np.linspace(0.0, 1.0, 256), np.linspace(0.0, 1.0, len(given))
+    return np.stack([np.interp(x, at, part).round().astype(np.uint8) for part in given.T], axis=1)
 
 
 def as_text(array: npt.NDArray[Any]) -> str:

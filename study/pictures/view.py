@@ -167,11 +167,13 @@ def view(folder: Path, field: str, save: Path | None) -> None:
         raise SceneError("there is no display here for a window; give --save move.png")
     import pyvista
 
+    from softgrasp.study.pictures.style import colour_map  # brings Matplotlib, as PyVista does
+
     bar: dict[str, Any] = {"title": f"{move.title}\n", "color": "black", "n_labels": 3, "fmt": "%.3g"}
     if save is not None:
         bar |= {"position_x": 0.15, "width": 0.65}  # of a quarter of the picture
     look = {
-        "scalars": "value", "clim": move.range, "cmap": "viridis", "ambient": 0.4, "show_edges": True,
+        "scalars": "value", "clim": move.range, "cmap": colour_map(), "ambient": 0.4, "show_edges": True,
         "edge_opacity": 0.2, "scalar_bar_args": bar,
     }  # fmt: skip
     shown = [0] if save is None else move.shown

@@ -20,7 +20,8 @@ from rich.console import Console
 from softgrasp.fem.errors import ResourceError, SceneError
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.study.forward.run import run_simulate
-from softgrasp.study.pictures.turning import Scene3D
+from softgrasp.study.pictures.style import colour_map
+from softgrasp.study.pictures.turning import Scene3D, colours
 from softgrasp.study.pictures.view import Move, view
 
 needs_pyvista = pytest.mark.skipif(importlib.util.find_spec("pyvista") is None, reason="no PyVista here")
@@ -105,6 +106,11 @@ def test_a_page_has_every_place_value_and_instant(two_legs: Path, tmp_path: Path
     corners = data["points"][0][data["triangles"].reshape(-1, 3)]
     sides = corners[:, 1:, :2] - corners[:, :1, :2]
     assert abs(np.linalg.det(sides)).sum() / 2 == pytest.approx(2.0, rel=1e-3)  # area of the strip; rounding of places
+
+
+def test_pages_have_the_colours_of_pictures() -> None:
+    exact = 255 * colour_map()(np.linspace(0.0, 1.0, 256))[:, :3]
+    assert np.abs(colours() - exact).max() <= 4  # of 255, straight between twenty of them; nobody sees it
 
 
 def test_a_page_thins_out_instants_and_keeps_what_moves_beside_the_body(monkeypatch: pytest.MonkeyPatch) -> None:
