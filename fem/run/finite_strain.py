@@ -6,7 +6,7 @@ With w = z_mid - z_n, s = 2/dt, pi = M v and the force f_alg of `softgrasp.fem.s
     R(w) = (s^2 M + s D) w + f_alg(z_n, w) - s pi_n - G c = 0,   z_{n+1} = z_n + 2 w,   s pi_{n+1} = 2 s^2 M w - s pi_n:
 
 the linear step with one more load, -(f_alg - K z_mid). The energy W + v'pi/2 changes by the work 2 c'G'w of the load,
-less what D dissipates, and by 2 w'R; so a step ends with a fraction of a correction that makes w'R = 0 to first order.
+less what D dissipates, and by 2 w'R; so a step ends with fractions of a correction that make w'R = 0 to rounding.
 A step that does not converge is divided into 2, 4, .. 16 substeps under the same load, that of the whole step where
 hand or controller respond to the tissue.
 """
@@ -25,10 +25,12 @@ from softgrasp.fem.petsc import SAME, Array, PETSc, combine, driven_by_root, tot
 from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState, viscosity
 from softgrasp.fem.solve.guess import STEPS, extrapolated
 from softgrasp.fem.strain.body import HyperelasticBody
-from softgrasp.fem.strain.newton import Counts, NewtonFigures, Pairs, QuasiNewton, Root
+from softgrasp.fem.strain.newton import EPS, Counts, NewtonFigures, Pairs, QuasiNewton, Root
 from softgrasp.fem.strain.points import whole_points
 
 MOST_SUBSTEPS = 16  # largest number of substeps of a step [1]
+BENDS = EPS**0.5  # of the loads: a larger R bends by more than rounding where its work is taken away [1]
+MOST_BALANCED = 10  # times that a step takes away the work of R: each leaves a share of about R over the loads [1]
 Begin = tuple[PETSc.Vec, Array, Array, float]  # z, s pi, v / s on the rows here, and the dissipated energy [J]
 
 
@@ -38,8 +40,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
     Attributes:
         r: s pi_n on the rows here, in place of the linear step's right-hand side.
         counts: convergence record of the run.
-        refactor_cost: iterations of the same time as a tangent and its factor [1], estimated from sizes, so
-            that it is the same in every run.
+        refactor_cost: iterations of the same time as a tangent and its factor [1], from sizes alone.
     """
 
     def _parts(self) -> tuple[PETSc.Mat, ...]:
@@ -203,32 +204,31 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     def _find(self, guess: Array, balanced: bool = True) -> Root:
         """The root, moved to w'R = 0 if it is to be ``balanced``. Collective."""
-        target = max(self.tol * self.substeps * self.counts.scale, 4 * self.body.rounding)
+        scale, cancel = self.substeps * self.counts.scale, self.newton.pairs.cancel
+        target = max(self.tol * scale, 4 * self.body.rounding)
         root = self.newton.find(guess, target)
-        moved = None
-        if balanced and root.iterations >= 0 and (moved := self._balance(root)) is None:  # R does work: iterate on
-            finer = self.newton.find(root.x, max(target / 30, 4 * self.body.rounding))
-            root = root if finer.iterations < 0 else finer._replace(iterations=root.iterations + finer.iterations)
-            moved = self._balance(root)
-        self.last = root.norm / (self.substeps * self.counts.scale) if self.counts.scale > 0 else 0.0
-        return root if moved is None else root._replace(x=moved)
+        if balanced and root.iterations >= 0:
+            moved = cancel(root.x, root.R)
+            if moved is None:  # R does work: iterate on
+                finer = self.newton.find(root.x, max(target / 30, 4 * self.body.rounding))
+                root = root if finer.iterations < 0 else finer._replace(iterations=root.iterations + finer.iterations)
+                moved = cancel(root.x, root.R)
+            for _ in range(MOST_BALANCED):
+                if moved is None or root.norm <= BENDS * scale:
+                    break
+                R, norm = self._residual(moved)
+                if not math.isfinite(norm):
+                    moved = None
+                    break
+                root = root._replace(x=moved, R=R, norm=norm)
+                moved = None if self.is_workless(moved, R) else cancel(moved, R)
+            root = root if moved is None else root._replace(x=moved)
+        self.last = root.norm / scale if scale > 0 else 0.0
+        return root
 
-    def _balance(self, root: Root) -> Array | None:
-        """The step w moved to w'R = 0 by a fraction of a correction, of earlier steps too; None if none is large."""
-        pairs, work = self.newton.pairs, self.dot(root.x, root.R)
-        if work == 0:
-            return root.x
-        bends = np.diag(pairs.products)  # dx'dr: w'R changes by -t (w'dr + dx'R) + t^2 dx'dr from w to w - t dx
-        slopes = self._dots(pairs.dr, root.x) + self._dots(pairs.dx, root.R)  # zero in an empty slot
-        # R bends along dx, and w'R is left with it: of this step's corrections the one with the least t dx'dr
-        near = [i for i in pairs.order if abs(slopes[i]) > 100 * abs(work)]
-        i = min(near, key=lambda i: bends[i] / abs(slopes[i])) if near else int(np.argmax(np.abs(slopes)))
-        if abs(work) >= 0.1 * abs(slopes[i]):
-            return None
-        t = work / slopes[i]
-        for _ in range(3):  # each adds two digits
-            t = work / (slopes[i] - t * bends[i])
-        return np.asarray(root.x - t * pairs.dx[i])
+    def is_workless(self, w: Array, R: Array) -> bool:
+        """Whether w'R is rounding of the loads' own work. Collective."""
+        return abs(self.dot(w, R)) <= EPS * self.dot(np.abs(w), np.abs(self.right))
 
     def _residual(self, w: Array) -> tuple[Array, float]:
         """R(w) and its norm, infinite where the law has no stress. Collective."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array
 
+EPS = float(np.finfo(float).eps)
 PAIRS = 4  # on 60 x 120 cells 2 need more iterations, 12 save none
 MOST = 40  # largest number of iterations [1]
 RENEW = 8  # iterations after which the tangent is factored anew [1]
@@ -93,6 +94,23 @@ class Pairs:
     def multiply(self, slot: int) -> None:
         """Update ``products`` for a new dr. Collective."""
         self.products[:, slot] = self.dots(self.dx, self.dr[slot])
+
+    def cancel(self, x: Array, R: Array) -> Array | None:
+        """Move x by a fraction of a correction, of earlier steps too, to x'R = 0; None if none is large. Collective."""
+        work = self.dots(x[None], R)[0]
+        if work == 0:
+            return x
+        bends = np.diag(self.products)  # dx'dr: x'R changes by -t (x'dr + dx'R) + t^2 dx'dr from x to x - t dx
+        slopes = self.dots(self.dr, x) + self.dots(self.dx, R)  # zero in an empty slot
+        # R bends along dx, and x'R is left with it: of this step's corrections the one with the least t dx'dr
+        near = [i for i in self.order if abs(slopes[i]) > 100 * abs(work)]
+        i = min(near, key=lambda i: bends[i] / abs(slopes[i])) if near else int(np.argmax(np.abs(slopes)))
+        if abs(work) >= 0.1 * abs(slopes[i]):
+            return None
+        t = work / slopes[i]
+        for _ in range(3):  # each adds two digits
+            t = work / (slopes[i] - t * bends[i])
+        return np.asarray(x - t * self.dx[i])
 
     def improve(self, solve: Callable[[Array], Array], R: Array) -> Array:
         """Approximation of J^-1 R, (rows,), J the Jacobian: L-BFGS's two loops around a solve with S. Collective."""

@@ -17,11 +17,11 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.contact.general import MOST, Contact, unsettled
 from softgrasp.fem.run.contact.rows import Rows
 from softgrasp.fem.run.contact.touching import Touching
-from softgrasp.fem.run.finite_strain import FiniteStrainMidpoint
+from softgrasp.fem.run.finite_strain import BENDS, MOST_BALANCED, FiniteStrainMidpoint
 from softgrasp.fem.run.midpoint import Feedback
 from softgrasp.fem.run.motion import Driven
+from softgrasp.fem.strain.newton import EPS
 
-EPS = float(np.finfo(float).eps)
 SHARE = EPS**0.5  # of w, over which the change of R is found: small are both its rounding and its bend along w [1]
 MOST_SCALED = 1e-3  # of w: near rest w is an error of the step as R is, and w'R no work to speak of [1]
 CLOSE = 1e-13  # of the body: gaps of pressed nodes at the end of the rounds [1]
@@ -58,15 +58,19 @@ class FiniteContactMidpoint(Touching, FiniteStrainMidpoint):
 
     def balance(self) -> bool:
         """Scale w to w'R = 0 and say whether that changed it. Collective."""
-        w = self.w_array
-        work = self.dot(w, self.R)
-        if abs(work) <= EPS * self.dot(np.abs(w), np.abs(self.right)):  # rounding of the loads' own work
-            return False
-        change = self.dot(w, self.R - self._residual((1 - SHARE) * w)[0]) / SHARE
-        if abs(work) > MOST_SCALED * change:
-            return False
-        self.w.array_w[:] = w - work / change * w
-        return True
+        w, R, scaled = self.w_array, self.R, False
+        for _ in range(MOST_BALANCED):
+            if self.is_workless(w, R):
+                break
+            work, change = self.dot(w, R), self.dot(w, R - self._residual((1 - SHARE) * w)[0]) / SHARE
+            if abs(work) > MOST_SCALED * change:
+                break
+            self.w.array_w[:] = w - work / change * w
+            scaled = True
+            if self.last <= BENDS:
+                break
+            R = self._residual(w)[0]
+        return scaled
 
 
 class FiniteContact(Contact):

@@ -45,9 +45,10 @@ def run(*overrides: str, **options: Any) -> Any:
 
 @pytest.mark.ranks(2)
 @pytest.mark.parametrize("damped", [True, False])
+@pytest.mark.parametrize("tol", [1e-4, 1e-9])
 @pytest.mark.parametrize("obstacle", [table(-0.03), DISC, BOX, POLYGON])
-def test_balance_closes_without_penetration(obstacle: str, damped: bool) -> None:
-    result = run(ON, obstacle, BETA if damped else "effects.damping=false")
+def test_balance_closes_without_penetration_at_every_tolerance(obstacle: str, tol: float, damped: bool) -> None:
+    result = run(ON, obstacle, BETA if damped else "effects.damping=false", f"effects.finite_strain={{tol={tol}}}")
     assert result.contact.touching.max() > 0
     assert result.energy_drift < 2e-14  # some units of rounding a step; measured at most 2e-15
     assert result.contact.penetration < 2 * 1e-12  # rounds end at 1e-13 of the body, of size 2
