@@ -181,6 +181,7 @@ def contact_keys(contact: ContactRecord) -> dict[str, Any]:
     return {
         "penetration": contact.penetration,
         "chatter": contact.chatter,
+        "chatter_end": contact.chatter_end,
         "work": contact.work,
         "taken_by_touch": contact.touch,
         "taken_by_impulses": contact.stopped,
@@ -232,7 +233,8 @@ def contact_rows(contact: ContactRecord) -> list[tuple[str, str]]:
         rows.append(("all obstacles", f"force ({force}) N at the end"))
     taken = f"{contact.touch:.3g} J at first touch, {contact.stopped:.3g} J by impulses"
     taken += f", {contact.rubbed:.3g} J by friction" if contact.rubbed else ""
-    kept = f"{contact.penetration:.1e} m, {contact.chatter}"
+    last = f", the last in step {contact.chatter_end} of {len(contact.force)}" if contact.chatter else ""
+    kept = f"{contact.penetration:.1e} m, {contact.chatter}{last}"
     return [*rows, ("dissipated by contact", taken), ("deepest penetration, chatter", kept)]
 
 

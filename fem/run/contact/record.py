@@ -65,6 +65,14 @@ class ContactRecord(Shown):
         return int(self.chattering.sum())
 
     @property
+    def chatter_end(self) -> int:
+        """Number of steps until no touching is taken back any more, 0 where none ever is.
+
+        A landing throws cells above pressed nodes upwards, which lifts some for a short time; at rest nothing chatters.
+        """
+        return int(np.flatnonzero(self.chattering.any(axis=1)).max(initial=-1)) + 1
+
+    @property
     def force_end(self) -> Array:
         """Force of each obstacle on the tissue at the end, mean of the last two steps, (obstacles, d) [N].
 

@@ -12,7 +12,9 @@ from mpi4py import MPI
 from softgrasp.fem.errors import CheckpointError, Paused
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.contact.flat import FlatContact
 from softgrasp.fem.run.contact.touching import Touching
+from softgrasp.fem.run.midpoint import TissueState
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.states import checkpoint
 
@@ -75,6 +77,58 @@ def test_it_is_that_of_the_forces_of_every_step(
     single = (on[1:-1] != on[2:]) & (on[:-2] == on[2:])  # another state than before and after, for one step
     assert np.array_equal(single.sum(axis=1), contact.chattering)
     assert 0 < contact.chatter == single.sum() < (on[1:] != on[:-1]).sum()
+    assert contact.chatter_end == 1 + np.flatnonzero(single.any(axis=(1, 2))).max()
+
+
+REST = ["time={steps=400, end=2}"]  # it rests after 1 s
+UPRIGHT = [
+    "tissue.cells=[3, 3, 3]", "tissue.order=1", "effects.reaction=false", "motion={profile='hold'}",
+    "effects.gravity={g=[0, 0, -9.81]}", "time.end=0.25", "time.steps=400",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("scene", "overrides", "rests"),
+    [
+        ("paper_forward", [*FALL, *REST, obstacles(TABLE), "effects.damping={kind='kelvin-voigt', beta=0.02}"], True),
+        (
+            "paper_forward",
+            [*FALL, *REST, obstacles(TABLE), "effects.damping={kind='rayleigh', alpha=9, beta=0.01}"],
+            True,
+        ),
+        ("paper_forward", [*FALL, obstacles(TABLE)], False),
+        ("set_down_3d", [*UPRIGHT, "obstacle=[{kind='halfspace', normal=[0, 0, 1], offset=-3e-5}]"], True),
+    ],
+)
+def test_pressed_nodes_stand_still_at_the_end_of_every_step(
+    scene: str, overrides: list[str], rests: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without impulses each of them moves up and down in turn as long as it is pressed, which no damping sees."""
+    speeds, advance = [], Touching.advance
+
+    def watched(midpoint: Touching, old: TissueState, new: TissueState) -> None:
+        advance(midpoint, old, new)
+        contact = midpoint.contact
+        assert contact is not None
+        v = contact.surface.gather(new.v.array_r).reshape(contact.p, contact.d)[:, -1]
+        speeds.append(np.where(contact.pressing()[:, -1] > 0, v, np.nan))
+
+    def moves() -> tuple[Any, Array, Array]:
+        speeds.clear()
+        contact = simulate(build(scene, overrides)).contact
+        v = np.array(speeds)
+        both = ~np.isnan(v[1:] + v[:-1])
+        return contact, v, (v[1:] * v[:-1] < 0)[both]
+
+    monkeypatch.setattr(Touching, "advance", watched)
+    contact, v, _ = moves()
+    monkeypatch.setattr(FlatContact, "_halt_flat", lambda *_: None)
+    _, free, turns = moves()
+    assert turns.mean() > 0.99
+    assert np.nanmax(np.abs(v)) < 1e-10 * np.nanmax(np.abs(free))  # rounding of the impulse
+    if rests:
+        assert contact.touching[-1].sum() > 3
+        assert contact.chatter_end < len(v) / 2
 
 
 @pytest.mark.ranks(3)

@@ -70,7 +70,7 @@ def test_energy_changes_by_the_work_of_the_load_alone(law: str, changes: dict[st
     """With a tolerance of 1e-6 as well: what an iteration leaves of forces does no work."""
     gentle = {} if changes is CUBE else GENTLE
     run = simulate(finite(gentle, changes, law=law, tol=1e-6))
-    assert run.energy_drift < 1e-13  # rounding: at most 1.4e-14, of forty elements in 3D; up to 3e-11 where R did work to second order
+    assert run.energy_drift < 1e-13  # measured at most 1.4e-14; up to 3e-11 where R does work to second order
     assert run.newton is not None
     assert 0.2 < run.newton.min_det < 1.0
     assert run.newton.substepped == 0

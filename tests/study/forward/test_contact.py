@@ -44,6 +44,7 @@ def test_forces_gaps_and_touching_nodes_are_in_the_files(tmp_path: Path) -> None
     assert result["contact"]["force_end"] == pytest.approx(contact.force_end.sum(axis=0), rel=1e-12)  # order of the sum
     assert keys["nodes_max"] == contact.touching.max() > 0
     assert result["contact"]["chatter"] == contact.chatter
+    assert result["contact"]["chatter_end"] == contact.chatter_end
     header, *rows = (tmp_path / "trajectory.csv").read_text().splitlines()
     names = header.split(",")
     table = np.array([[float(x) for x in row.split(",")] for row in rows])
