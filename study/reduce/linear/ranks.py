@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 
+import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem import Model, Scene, build
@@ -40,36 +41,90 @@ def of_each_rank(model: Model, scene: Scene) -> tuple[Model, MPI.Intracomm]:
 def divided[T](
     ranks: MPI.Intracomm, shares: Sequence[Sequence[Callable[[], T]]], same: Sequence[object] = ()
 ) -> list[T]:
-    """Results of the calls of all shares, one for each rank; on one rank a forked process begins with a second share.
+    """Results of the calls of all shares, one for each rank; who is done with its own goes on with others' last ones.
 
-    Collective; the calls must not communicate. ``same``, Raises: as in :func:`dealt`.
+    On one rank a forked process begins with a second share; ranks of several nodes keep to their own. Collective; the
+    calls must not communicate. ``same``, Raises: as in :func:`dealt`.
     """
     if ranks.size == 1:
         own, *beside = shares
         return shared(own, [call for share in beside for call in share], same)
-    parts = dealt(ranks, [partial(_in_turn, share) for share in shares], same)
-    return [each for part in parts for each in part]
-
-
-def _in_turn[T](calls: Sequence[Callable[[], T]]) -> list[T]:
-    return [call() for call in calls]
+    calls = [call for share in shares for call in share]
+    owners = [rank for rank, share in enumerate(shares) for _ in share]
+    order = sorted(range(len(calls)), key=lambda i: (owners[i] != ranks.rank, i if owners[i] == ranks.rank else -i))
+    return _first_come(ranks, calls, owners, order, same)
 
 
 def dealt[T](ranks: MPI.Intracomm, calls: Sequence[Callable[[], T]], same: Sequence[object] = ()) -> list[T]:
-    """Results of all calls on every rank, each made by one of them. Collective; the calls must not communicate.
+    """Results of all calls on every rank; a rank takes the next one as soon as it is done with the one before.
+
+    The longest should come first. Collective; the calls must not communicate.
 
     ``same``: objects in the results that are not sent, but are each rank's own.
 
     Raises Exception: that of the lowest rank with a call that fails.
     """
     if ranks.size == 1:
-        return _in_turn(calls)
+        return [call() for call in calls]
+    return _first_come(ranks, calls, [i % ranks.size for i in range(len(calls))], range(len(calls)), same)
+
+
+def _first_come[T](
+    ranks: MPI.Intracomm,
+    calls: Sequence[Callable[[], T]],
+    owners: Sequence[int],
+    order: Sequence[int],
+    same: Sequence[object],
+) -> list[T]:
+    """Results of all calls on every rank. Collective.
+
+    Args:
+        owners: the rank of each call, where ranks cannot ask each other.
+        order: in which this rank takes calls.
+    """
     found: dict[int, T] = {}
     sent = b""
-    with raise_on_all_ranks(ranks):
-        found = {i: calls[i]() for i in range(ranks.rank, len(calls), ranks.size)}
+    with _taking(ranks, owners) as take, raise_on_all_ranks(ranks):
+        found = {i: calls[i]() for i in order if take(i)}
         sent = packed(found, same)
     for rank, part in enumerate(ranks.allgather(sent)):
         if rank != ranks.rank:
             found |= unpacked(part, same)
     return [found[i] for i in range(len(calls))]
+
+
+@contextmanager
+def _taking(ranks: MPI.Intracomm, owners: Sequence[int]) -> Iterator[Callable[[int], bool]]:
+    """A function that takes a call, by its number, unless another rank has taken it. Collective.
+
+    Numbers in memory that ranks share count how often each was asked for: no rank waits for another. Without such
+    memory a rank takes what is its own.
+
+    ``owners``: rank of each call.
+    """
+    node = ranks.Split_type(MPI.COMM_TYPE_SHARED)
+    together = node.size == ranks.size
+    node.Free()
+    if not together:
+        yield lambda i: owners[i] == ranks.rank
+        return
+    one, before = np.ones(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
+    window = MPI.Win.Allocate_shared(one.nbytes * len(owners) * (ranks.rank == 0), one.nbytes, comm=ranks)
+    if ranks.rank == 0:
+        np.frombuffer(window.Shared_query(0)[0], dtype=np.int64)[:] = 0
+    ranks.Barrier()
+    window.Lock_all()
+
+    def take(i: int) -> bool:
+        window.Fetch_and_op(one, before, 0, i)
+        window.Flush(0)
+        return not before[0]
+
+    try:
+        yield take
+    except Exception:  # on all ranks
+        window.Unlock_all()
+        window.Free()
+        raise
+    window.Unlock_all()
+    window.Free()
