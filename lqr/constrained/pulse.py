@@ -140,8 +140,8 @@ class PulseError:
         """
         rest = self.rest
         instants = self.grid * np.linspace(0, 1, FINE + 1) if rest is None else rest.instants
+        before = self._at(0, instants[0], largest)  # refuses modes that hardly decay
         fourth, most = self.modewise(4) @ largest, np.zeros(self.full.seen.shape[:2])
-        before = self._at(0, instants[0], largest)
         for i, (s, now) in enumerate(pairwise(instants.tolist())):
             at = self._at(i + 1, now, largest)
             leaves = (now - s) ** 2 / 8
