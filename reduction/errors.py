@@ -6,8 +6,13 @@ of the views of the largest model of a family, and snapshots X = Q C + rest,
     |X - V Y|_F^2 = |rest|_F^2 + |C - R Y|_F^2
 
 for every model whose columns lie in the span of Q: no cancellation, and the snapshots are read once for all views and
-sizes of a family, and for all families that :func:`prepare` is given together. Of a run whose snapshots are condensed,
-X = X_r W' (:mod:`softgrasp.reduction.bases.condense`), the few columns X_r are read instead.
+sizes of a family, and for all families that :func:`prepare` is given together. These have one orthonormal basis J of
+all their Q in a view, so that X is multiplied by J alone: with X = J C_J + rest_J and Q = J P,
+
+    C = P' C_J,    |rest|_F^2 = |rest_J|_F^2 + |C_J - P C|_F^2.
+
+Of a run whose snapshots are condensed, X = X_r W' (:mod:`softgrasp.reduction.bases.condense`), the few columns X_r are
+read instead.
 """
 
 from __future__ import annotations
@@ -83,7 +88,7 @@ def state_rows(view: View, system: BlockSystem, z: Array, v_z: Array, q_s: Array
     """
     tissue, hand = row_weights(system)
     if view == "deformation":
-        return np.vstack([tissue * z, tissue * v_z])
+        return np.vstack([tissue * z, tissue * v_z] if system.graded else [z, v_z])
     T, top = system.T, 1 if system.layout.comm.rank == 0 else 0  # the hand counts once
     if view == "velocities":
         second, p_s = v_z + T @ v_s, v_s
@@ -114,14 +119,29 @@ def shown_rows(view: View, model: ReducedModel, small: EnergySystem, system: Blo
 
 
 @dataclass(frozen=True)
+class Columns:
+    """Orthonormal columns of one view, among those of other families."""
+
+    view: View  # state that the rows belong to
+    Q: Array  # local rows (rows, k)
+    J: Array  # orthonormal columns that span those of all these families, local rows (rows, K); Q itself of one alone
+    P: Array | None  # J'Q, (K, k), on every rank; None of one alone
+
+
+@dataclass(frozen=True)
 class Span:
     """Snapshots in the columns of one orthonormal basis, X = Q C + rest."""
 
     comm: MPI.Intracomm  # ranks of the rows
-    Q: Array  # local rows (rows, k)
+    columns: Columns  # that basis
     C: Array  # (k, m), on every rank
     rest: float  # |X - Q C|_F^2
     square: float  # |X|_F^2
+
+    @property
+    def Q(self) -> Array:
+        """Local rows (rows, k)."""
+        return self.columns.Q
 
     def inside(self, V: Array) -> Array:
         """R = Q'V for columns V, local rows, that lie in the span. Collective. Raises ModelError: they do not."""
@@ -145,33 +165,55 @@ class Span:
         return ratio(self.rest + squares(left), self.square)
 
 
-def spans_in(bases: Sequence[tuple[View, Array]], system: BlockSystem, snapshots: Snapshots) -> list[Span]:
-    """Snapshots in orthonormal columns Q of their views, local rows: the snapshots are read once for all. Collective.
+def columns_of(bases: Sequence[tuple[View, Array]], comm: MPI.Intracomm) -> list[Columns]:
+    """Orthonormal columns of several families with one basis J of each view. Collective.
 
-    ``bases``: view and Q of each.
+    ``bases``: view and Q of each, local rows.
+
+    Raises SolverError: the factorisation fails.
     """
+    made: dict[int, Columns] = {}
+    for view in VIEWS:
+        every = {i: Q for i, (own, Q) in enumerate(bases) if own == view}
+        if len(every) > 1:
+            J = factor(comm, np.hstack(list(every.values()))).Q
+            made |= {i: Columns(view, Q, J, total(comm, J.T @ Q)) for i, Q in every.items()}
+        else:
+            made |= {i: Columns(view, Q, Q, None) for i, Q in every.items()}
+    return [made[i] for i in range(len(bases))]
+
+
+def spans_in(bases: Sequence[Columns], system: BlockSystem, snapshots: Snapshots) -> list[Span]:
+    """Snapshots in orthonormal columns: the snapshots are read once for all. Collective."""
     comm, n = system.layout.comm, system.layout.n_local
     whole_run: Condensed | None = snapshots.kept.get(Condensed)
     if whole_run is not None:
         snapshots = whole_run.few
-    C: list[list[Array]] = [[] for _ in bases]
-    rests, whole = np.zeros(len(bases)), dict.fromkeys((view for view, _ in bases), 0.0)
+    joined = {id(each.J): (each.view, each.J) for each in bases}
+    C: dict[int, list[Array]] = {key: [] for key in joined}
+    rests, whole = dict.fromkeys(joined, 0.0), {each.view: 0.0 for each in bases}
     for b in column_blocks(snapshots.Z.shape[1]):
         Z, hand = snapshots.Z[:, b], (snapshots.q_s[:, b], snapshots.v_s[:, b])
         seen = {view: state_rows(view, system, Z[:n], Z[n:], *hand) for view in whole}
         for view, X in seen.items():
             whole[view] += squares(X)
-        for i, (view, Q) in enumerate(bases):
+        for key, (view, J) in joined.items():
             X = seen[view]
-            C[i].append(total(comm, Q.T @ X))
-            rests[i] += squares(X - Q @ C[i][-1])  # rounding leaves eps |X|, far below the error of any model
-    left = total(comm, np.array([*whole.values(), *rests])).tolist()
+            C[key].append(total(comm, J.T @ X))
+            rests[key] += squares(X - J @ C[key][-1])  # rounding leaves eps |X|, far below the error of any model
+    left = total(comm, np.array([*whole.values(), *rests.values()])).tolist()
     square = dict(zip(whole, left, strict=False))
-    every = zip(bases, C, left[len(whole) :], strict=True)
-    parts = [(view, Q, np.hstack(c), rest) for (view, Q), c, rest in every]
-    if whole_run is not None:
-        parts = [(view, Q, c @ whole_run.W.T, rest) for view, Q, c, rest in parts]
-    return [Span(comm, Q, c, rest, square[view]) for view, Q, c, rest in parts]
+    rest = dict(zip(rests, left[len(whole) :], strict=True))
+    every = {key: np.hstack(parts) for key, parts in C.items()}
+    spans = []
+    for each in bases:
+        c, lost = every[id(each.J)], rest[id(each.J)]
+        if each.P is not None:
+            C_J, c = c, each.P.T @ c
+            lost += squares(C_J - each.P @ c)
+        c = c if whole_run is None else c @ whole_run.W.T
+        spans.append(Span(comm, each, c, lost, square[each.view]))
+    return spans
 
 
 @dataclass(frozen=True)
@@ -248,7 +290,8 @@ def prepare(comparisons: Sequence[ModelComparison], views: Sequence[View]) -> No
     comm, bases = first.system.layout.comm, list[tuple[View, Array]]()
     for each, view in missing:
         bases.append((view, factor(comm, shown_rows(view, each.model, each.small, each.system)).Q))
-    for (each, view), span in zip(missing, spans_in(bases, first.system, first.snapshots), strict=True):
+    found = spans_in(columns_of(bases, comm), first.system, first.snapshots)
+    for (each, view), span in zip(missing, found, strict=True):
         each._spans[view] = span
 
 
@@ -266,10 +309,10 @@ def all_at(
         system, snapshots, energy: as in :class:`ModelComparison`, of that run.
     """
     spans: list[dict[View, Span]] = [{} for _ in known]
-    every = [(i, view, span.Q) for i, each in enumerate(known) for view, span in each._spans.items()]
-    found = spans_in([(view, Q) for _, view, Q in every], system, snapshots) if every else []
-    for (i, view, _), span in zip(every, found, strict=True):
-        spans[i][view] = span
+    every = [(i, span.columns) for i, each in enumerate(known) for span in each._spans.values()]
+    found = spans_in([columns for _, columns in every], system, snapshots) if every else []
+    for (i, columns), span in zip(every, found, strict=True):
+        spans[i][columns.view] = span
     pairs = zip(known, places, spans, strict=True)
     return [ModelComparison(each.model, small, system, snapshots, energy, own) for each, small, own in pairs]
 
