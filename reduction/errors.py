@@ -224,7 +224,7 @@ class ModelComparison:
     small: EnergySystem  # its system at the parameter of the snapshots
     system: BlockSystem  # system of the full run
     snapshots: Snapshots  # snapshots of the full run
-    energy: Array  # :func:`full_energy` of the snapshots
+    energy: Array | None = None  # :func:`full_energy` of the snapshots; None: made when asked for
     _spans: dict[View, Span] = field(default_factory=dict, repr=False)
     # views of the last model, in the span of each view
     _shown: dict[View, tuple[ReducedModel, Array]] = field(default_factory=dict, repr=False)
@@ -263,8 +263,9 @@ class ModelComparison:
         """All errors of a run; see :meth:`state_error`. Collective."""
         prepare([self], VIEWS)
         velocities, momenta, deformation = (self.state_error(view, model, small, run) for view in VIEWS)
-        error = np.abs(small.energy(run.x[self.snapshots.steps]) - self.energy).max(initial=0.0)
-        peak = float(self.energy.max(initial=0.0))
+        energy = full_energy(self.system, self.snapshots.Z) if self.energy is None else self.energy
+        error = np.abs(small.energy(run.x[self.snapshots.steps]) - energy).max(initial=0.0)
+        peak = float(energy.max(initial=0.0))
         return ModelErrors(velocities, momenta, deformation, float(error) / (peak if peak > 0 else 1.0))
 
     def projection_error(self, view: View, model: ReducedModel, small: EnergySystem) -> float:
@@ -300,13 +301,12 @@ def all_at(
     places: Sequence[EnergySystem],
     system: BlockSystem,
     snapshots: Snapshots,
-    energy: Array,
 ) -> list[ModelComparison]:
     """The same families against a run that differs in stiffness alone: the spans of their models stay. Collective.
 
     Args:
         places: systems of their largest models at the parameter of that run.
-        system, snapshots, energy: as in :class:`ModelComparison`, of that run.
+        system, snapshots: of that run.
     """
     spans: list[dict[View, Span]] = [{} for _ in known]
     every = [(i, span.columns) for i, each in enumerate(known) for span in each._spans.values()]
@@ -314,7 +314,7 @@ def all_at(
     for (i, columns), span in zip(every, found, strict=True):
         spans[i][columns.view] = span
     pairs = zip(known, places, spans, strict=True)
-    return [ModelComparison(each.model, small, system, snapshots, energy, own) for each, small, own in pairs]
+    return [ModelComparison(each.model, small, system, snapshots, None, own) for each, small, own in pairs]
 
 
 def with_hand(small: EnergySystem) -> Array:

@@ -61,61 +61,42 @@ def weights(system: BlockSystem, inner: InnerName) -> tuple[Weight, Weight] | No
 
 @dataclass(frozen=True)
 class Rows:
-    """How some row blocks are stacked on a rank: hand rows of every half (rank 0 only), then tissue rows."""
+    """How the row blocks of one half are stacked on a rank: hand rows (rank 0 only), then tissue rows."""
 
     layout: BlockLayout  # sizes and ownership
-    halves: int  # 1 for displacements or momenta alone, 2 for both
     hand: bool  # whether the hand's rows are included
 
     @property
     def top(self) -> int:
-        """Hand rows of one half on this rank."""
+        """Hand rows on this rank."""
         return self.layout.n_s if self.hand and self.layout.comm.rank == 0 else 0
 
     @property
     def local(self) -> int:
         """Rows on this rank."""
-        return self.halves * (self.top + self.layout.n_local)
+        return self.top + self.layout.n_local
 
-    def hand_rows(self, half: int) -> slice:
-        """Rows of the hand in one half."""
-        return slice(half * self.top, (half + 1) * self.top)
-
-    def tissue_rows(self, half: int) -> slice:
-        """Rows of the tissue in one half."""
-        start, n = self.halves * self.top, self.layout.n_local
-        return slice(start + half * n, start + (half + 1) * n)
-
-    def fill(self, X: Array, half: int, s: Array, e: Array) -> None:
-        """Copy hand and tissue rows of one half into a stack."""
-        X[self.hand_rows(half)] = s[: self.top]
-        X[self.tissue_rows(half)] = e
-
-    def stack(self, *halves: tuple[Array, Array]) -> Array:
-        """Stack (hand, tissue) pairs, Fortran order."""
-        X = np.empty((self.local, halves[0][1].shape[1]), order="F")
-        for half, (s, e) in enumerate(halves):
-            self.fill(X, half, s, e)
+    def stack(self, s: Array, e: Array) -> Array:
+        """Rows of hand and tissue as one stack, Fortran order."""
+        X = np.empty((self.local, e.shape[1]), order="F")
+        X[: self.top], X[self.top :] = s[: self.top], e
         return X
 
-    def split(self, X: Array) -> list[tuple[Array, Array]]:
+    def split(self, X: Array) -> tuple[Array, Array]:
         """Undo :meth:`stack`; the hand's rows come to every rank, zero when it is not included. Collective."""
-        comm, n_s = self.layout.comm, self.layout.n_s
-        s = [np.zeros((n_s, X.shape[1])) for _ in range(self.halves)]
+        s = np.zeros((self.layout.n_s, X.shape[1]))
         if self.hand:
-            s = comm.bcast([np.array(X[self.hand_rows(h)]) for h in range(self.halves)])
-        return [(s[h], np.asfortranarray(X[self.tissue_rows(h)])) for h in range(self.halves)]
+            s = self.layout.comm.bcast(np.array(X[: self.top]))
+        return s, np.asfortranarray(X[self.top :])
 
-    def weigh(self, X: Array, by: tuple[Weight, ...] | None) -> Array:
-        """Return W X for the weight of each half; X itself without weights. Collective."""
+    def weigh(self, X: Array, by: Weight | None) -> Array:
+        """Return W X; X itself without weight. Collective."""
         if by is None:
             return X
         result = np.empty_like(X, order="F")
-        for half, weight in enumerate(by[: self.halves]):
-            rows, hand = self.tissue_rows(half), self.hand_rows(half)
-            result[rows] = times_columns(weight.tissue, X[rows])
-            if self.top:
-                result[hand] = weight.hand @ X[hand]
+        result[self.top :] = times_columns(by.tissue, X[self.top :])
+        if self.top:
+            result[: self.top] = by.hand @ X[: self.top]
         return result
 
     def gram(self, X: Array, Y: Array) -> Array:
@@ -128,18 +109,18 @@ def orthonormality(basis: Basis, system: BlockSystem) -> float:
 
     With fixed solid modes the tissue columns alone count: those of the hand are unit vectors.
     """
-    rows, by = Rows(basis.layout, 1, hand=True), weights(system, basis.inner)
+    rows, by = Rows(basis.layout, hand=True), weights(system, basis.inner)
     first = 2 * basis.layout.n_s if basis.fixed_solid else 0
     (s_q, s_p), (e_q, e_p) = (
         (X[:, first:] for X in pair) for pair in ((basis.V_sq, basis.V_sv), (basis.V_q, basis.V_p))
     )
-    q, p = rows.stack((s_q, e_q)), rows.stack((s_p, e_p))
+    q, p = rows.stack(s_q, e_q), rows.stack(s_p, e_p)
     W_q, W_p = q, p
     if by is not None:
-        W_q = basis.rate * rows.weigh(q, by[:1])
+        W_q = basis.rate * rows.weigh(q, by[0])
         if basis.coordinates == "qp":
             inverse = np.linalg.solve(by[0].hand, s_p), solve_columns(by[0].tissue, basis.layout, e_p)
-            W_p = rows.stack(inverse) / basis.rate
+            W_p = rows.stack(*inverse) / basis.rate
         else:
-            W_p = rows.weigh(p, by[:1] if basis.pairs else by[1:])
+            W_p = rows.weigh(p, by[0 if basis.pairs else 1])
     return float(np.abs(rows.gram(q, W_q) + rows.gram(p, W_p) - np.eye(basis.N - first)).max(initial=0.0))

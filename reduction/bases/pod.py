@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -40,9 +40,9 @@ class PartsRequest:
         self,
         name: str,
         rows: Rows,
-        hand: Sequence[Array],
+        hand: Array,
         tissue: Callable[[], Array],
-        by: tuple[Weight, ...] | None,
+        by: Weight | None,
         k: int | None = None,
     ) -> Stack:
         """The snapshots of these rows in few coordinates, see :func:`softgrasp.reduction.bases.stack.stack_of`."""
@@ -51,38 +51,45 @@ class PartsRequest:
         return made
 
 
-def pod_part(title: str, stack: Stack, blocks: Sequence[int]) -> Part:
+def pod_part(title: str, stacks: Mapping[int, Stack]) -> Part:
     """POD_k(X): the k leading left singular vectors in the inner product W, U' W U = I. Collective.
 
     They minimise sum_j |x_j - U U' W x_j|_W^2.
 
-    ``blocks``: which halves of a basis the rows of U are: 0 displacement, 1 velocity; the others are zero.
+    ``stacks``: the rows of X by the half of a basis that they are: 0 displacement, 1 velocity; the others are zero.
     """
-    rows, comm = stack.rows, stack.rows.layout.comm
+    (one, *_), scale = stacks.values(), max(stack.scale for stack in stacks.values())
+    rows, comm = one.rows, one.rows.layout.comm
 
-    def place(U: Array) -> tuple[Columns, ...]:
-        halves = dict(zip(blocks, rows.split(U), strict=True))
-        (hand, tissue), *_ = halves.values()
+    def place(U: Mapping[int, Array]) -> tuple[Columns, ...]:
+        halves = {i: rows.split(part) for i, part in U.items()}
+        ((hand, tissue), *_) = halves.values()
         (s_q, e_q), (s_p, e_p) = (
             halves[i] if i in halves else (np.zeros_like(hand), np.zeros_like(tissue)) for i in (0, 1)
         )
         return (Columns(s_q, s_p, e_q, e_p),)
 
-    if not stack.R.any():
-        return Part(title, np.zeros(0), 0.0, 0, lambda _: place(np.zeros((rows.local, 0))))
-    u, s, _ = small_svd(comm, stack.orthonormal)
+    if not any(stack.R.any() for stack in stacks.values()):
+        return Part(title, np.zeros(0), 0.0, 0, lambda _: place(dict.fromkeys(stacks, np.zeros((rows.local, 0)))))
+    coordinates = [stack.orthonormal * (stack.scale / scale) for stack in stacks.values()]
+    u, s, _ = small_svd(comm, np.vstack(coordinates))
+    ends = np.cumsum([len(each) for each in coordinates])[:-1]
 
     def columns(k: int) -> tuple[Columns, ...]:
-        U = stack.vectors(u[:, :k])
-        if stack.by is not None and k:
+        parts = zip(stacks.items(), np.split(u[:, :k], ends), strict=True)
+        U = {i: stack.vectors(C) for (i, stack), C in parts}
+        if one.by is not None and k:
             # one more step removes the rounding of L^-1; it is triangular, so the nested spans stay
-            repair = cholesky_of(comm, rows.gram(U, rows.weigh(U, stack.by)))
-            U = U @ np.linalg.inv(repair.T)
+            W_U = {i: rows.weigh(part, stacks[i].by) for i, part in U.items()}
+            repair = cholesky_of(comm, np.sum([rows.gram(U[i], W_U[i]) for i in U], axis=0))
+            U = {i: part @ np.linalg.inv(repair.T) for i, part in U.items()}
         return place(U)
 
-    f = stack.factor
-    square = f.square if stack.by is None else float(np.sum(s**2))
-    return Part(title, s, square, numerical_rank(s, f.noise), columns, f.scale)
+    square = float(np.sum(s**2))
+    if one.by is None:
+        square = sum(stack.factor.square * (stack.scale / scale) ** 2 for stack in stacks.values())
+    noise = max(stack.factor.noise for stack in stacks.values())
+    return Part(title, s, square, numerical_rank(s, noise), columns, scale)
 
 
 def joint_parts(request: PartsRequest) -> tuple[Part, ...]:
@@ -91,10 +98,7 @@ def joint_parts(request: PartsRequest) -> tuple[Part, ...]:
     With fixed solid modes V = blkdiag(I, V_e), I of order 2 n_s for the hand, V_e = POD_k(X_e), X_e = [q_e; v_e].
     V' W V = I over displacement and velocity rows together. Collective.
     """
-    b, rows = request.snapshots, Rows(request.states.layout, 2, request.hand)
-    by = weights(request.states.system, request.inner)
-    stack = request.stack("states", rows, (b.s_q, b.s_p), lambda: np.vstack([b.e_q, b.e_p]), by, request.k)
-    return (pod_part("states", stack, (0, 1)),)
+    return (pod_part("states", _halves(request, None)),)
 
 
 def componentwise_parts(request: PartsRequest) -> tuple[Part, ...]:
@@ -103,11 +107,17 @@ def componentwise_parts(request: PartsRequest) -> tuple[Part, ...]:
     With fixed solid modes V = blkdiag(I, V_e), I of order 2 n_s for the hand, V_e the same of the tissue's rows.
     V_q' W_q V_q = I and V_v' W_v V_v = I. Collective.
     """
-    b, rows = request.snapshots, Rows(request.states.layout, 1, request.hand)
-    by = weights(request.states.system, request.inner)
-    q, v = (None, None) if by is None else ((by[0],), (by[1],))
-    halves = (("displacements", b.s_q, b.e_q, q), ("velocities", b.s_p, b.e_p, v))
-    return tuple(
-        pod_part(title, request.stack(title, rows, (hand,), partial(np.asarray, tissue), weight, request.k), (half,))
-        for half, (title, hand, tissue, weight) in enumerate(halves)
-    )
+    halves = _halves(request, request.k)
+    return tuple(pod_part(title, {i: halves[i]}) for i, title in enumerate(("displacements", "velocities")))
+
+
+def _halves(request: PartsRequest, k: int | None) -> dict[int, Stack]:
+    """Displacements and velocities, each in few coordinates, of which joint and componentwise bases are made."""
+    b, rows = request.snapshots, Rows(request.states.layout, request.hand)
+    by = weights(request.states.system, request.inner) or (None, None)
+    k = k if request.engine != "tsqr" else None
+    parts = (("displacements", b.s_q, b.e_q), ("velocities", b.s_p, b.e_p))
+    return {
+        i: request.stack(title, rows, hand, partial(np.asarray, tissue), by[i], k)
+        for i, (title, hand, tissue) in enumerate(parts)
+    }

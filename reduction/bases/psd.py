@@ -44,7 +44,7 @@ class Canonical:
         return self.stack.rows
 
     @property
-    def by(self) -> tuple[Weight, ...] | None:
+    def by(self) -> Weight | None:
         """The weight A, or None."""
         return self.stack.by
 
@@ -59,9 +59,9 @@ class Canonical:
     def place(self, E_q: Array, E_y: Array) -> Columns:
         """Columns of V from q~ and y~ rows. Collective."""
         root = self.rate**0.5
-        ((s_q, e_q),) = self.rows.split(E_q / root if root != 1.0 else E_q)
+        s_q, e_q = self.rows.split(E_q / root if root != 1.0 else E_q)
         E_p = self.weigh(E_y) if self.momenta else E_y
-        ((s_p, e_p),) = self.rows.split(E_p * root if root != 1.0 else E_p)
+        s_p, e_p = self.rows.split(E_p * root if root != 1.0 else E_p)
         return Columns(s_q, s_p, e_q, e_p)
 
 
@@ -71,12 +71,12 @@ def canonical(request: PartsRequest) -> Canonical:
     Raises BasisError: all snapshots are zero.
     """
     b, system = request.snapshots, request.states.system
-    rows, m = Rows(system.layout, 1, request.hand), b.e_q.shape[1]
+    rows, m = Rows(system.layout, request.hand), b.e_q.shape[1]
     both = weights(system, request.inner)
-    by = None if both is None else both[:1]
+    by = None if both is None else both[0]
     momenta = request.coordinates == "qp"
     scale = magnitude(system.layout.comm, b.s_q, b.s_p, b.e_q, b.e_p)
-    s_p = b.s_p if by is None or not momenta else np.linalg.solve(by[0].hand, b.s_p / scale) * scale
+    s_p = b.s_p if by is None or not momenta else np.linalg.solve(by.hand, b.s_p / scale) * scale
 
     def tissue() -> Array:
         Z = np.empty((system.layout.n_local, 2 * m), order="F")
@@ -84,10 +84,10 @@ def canonical(request: PartsRequest) -> Canonical:
         Z[:, m:] = b.e_p
         Z /= scale
         if by is not None and momenta:
-            Z[:, m:] = solve_columns(by[0].tissue, system.layout, Z[:, m:])
+            Z[:, m:] = solve_columns(by.tissue, system.layout, Z[:, m:])
         return Z
 
-    stack = request.stack("canonical", rows, (np.hstack([b.s_q, s_p]) / scale,), tissue, by)
+    stack = request.stack("canonical", rows, np.hstack([b.s_q, s_p]) / scale, tissue, by)
     if not stack.R.any():
         raise BasisError("all snapshots are zero; there is nothing to build a basis from")
     C, rate = stack.orthonormal, 1.0

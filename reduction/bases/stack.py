@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,7 +25,7 @@ class Stack:
     factor: Factor  # Q, and what belongs to it
     R: Array  # coordinates [hand; tissue] of X / scale, the same on every rank
     L: Array | None  # Cholesky factor of the weight in these coordinates; None without weight
-    by: tuple[Weight, ...] | None  # weight of every half; None is Euclidean
+    by: Weight | None  # weight; None is Euclidean
     spared: float = 0.0  # processor time that another basis spent on the factor [s]
 
     @property
@@ -50,9 +50,9 @@ def stack_of(
     kept: dict[object, Any],
     name: object,
     rows: Rows,
-    hand: Sequence[Array],
+    hand: Array,
     tissue: Callable[[], Array],
-    by: tuple[Weight, ...] | None,
+    by: Weight | None,
     engine: EngineName,
     k: int | None = None,
 ) -> Stack:
@@ -65,9 +65,9 @@ def stack_of(
     Args:
         kept: factors that are there, by name.
         name: of the tissue's rows and of the weight.
-        hand: rows of the hand, one block (n_s, m) for every half, on every rank.
+        hand: rows of the hand (n_s, m), on every rank.
         tissue: makes the tissue's local rows.
-        by: weight of every half; None is Euclidean.
+        by: weight; None is Euclidean.
         k: leading triplets that are enough, None for all.
 
     Raises:
@@ -83,7 +83,7 @@ def stack_of(
         begin = time.thread_time()
         X = tissue()
         if not apart:
-            X = np.asfortranarray(np.vstack([*(h for h in hand if rows.top), X]))
+            X = rows.stack(hand, X)
         some = comm.allreduce(bool(np.any(X)), MPI.LOR)
         f = factor(comm, X, engine, whole) if some else Factor(X[:, :0], np.zeros((0, X.shape[1])), 1.0, EPS, 0.0)
         L = None if by is None else cholesky_of(comm, inner.gram(f.Q, inner.weigh(f.Q, by)))
@@ -91,10 +91,10 @@ def stack_of(
     f, L, _ = kept[key]
     if not apart or not rows.hand:
         return Stack(rows, f, f.R, L, by, spared)
-    top = np.vstack(hand) / f.scale
+    top = hand / f.scale
     f = replace(f, square=f.square + float(np.vdot(top, top)))
     if by is not None:
-        L = scipy.linalg.block_diag(*(cholesky_of(comm, weight.hand) for weight in by[: rows.halves]), L)
+        L = scipy.linalg.block_diag(cholesky_of(comm, by.hand), L)
     return Stack(rows, f, np.vstack([top, f.R]), L, by, spared)
 
 

@@ -320,8 +320,9 @@ def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
         V = np.asfortranarray(parts[0][n:])
         q, p = (float(layout.comm.allreduce(np.vdot(Y, times_columns(system.M_ee, Y)))) for Y in (X, V))
         X = np.asfortranarray(np.hstack([X, V * (q / p) ** 0.5 if p > 0 else V]))
-    rows, mass = Rows(layout, 1, hand=False), Weight(system.M_hand, system.M_ee)
-    part = pod_part("deformation", stack_of({}, "deformation", rows, (), lambda: X, (mass,), "tsqr"), (0,))
+    rows, mass = Rows(layout, hand=False), Weight(system.M_hand, system.M_ee)
+    none = np.zeros((layout.n_s, X.shape[1]))
+    part = pod_part("deformation", {0: stack_of({}, "deformation", rows, none, lambda: X, mass, "tsqr")})
     if k > part.rank:
         most = 2 * (layout.n_s + part.rank)
         raise BasisError(f"more displacements than the snapshots carry above rounding; request N <= {most}", most=most)

@@ -115,10 +115,10 @@ def symplecticity(basis: Basis) -> float:
 
     J = [0 I; -I 0] on the rows (q; p) and on the columns (first half; second half).
     """
-    rows = Rows(basis.layout, 1, hand=True)
+    rows = Rows(basis.layout, hand=True)
     first = 2 * basis.layout.n_s if basis.fixed_solid else 0
-    q = rows.stack((basis.V_sq, basis.V_q))[:, first:]
-    p = rows.stack((basis.V_sv, basis.V_p))[:, first:]
+    q = rows.stack(basis.V_sq, basis.V_q)[:, first:]
+    p = rows.stack(basis.V_sv, basis.V_p)[:, first:]
     form = rows.gram(q, p)
     k = form.shape[0] // 2
     J = np.eye(2 * k, k=k) - np.eye(2 * k, k=-k)

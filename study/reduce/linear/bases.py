@@ -48,7 +48,10 @@ def small(states: States) -> bool:
 
 
 def shares_of(names: Sequence[str], count: int = 2) -> list[list[str]]:
-    """Methods for processes or ranks with about equal work; those that share a tall factor stay together."""
+    """Methods for processes or ranks with about equal work; those that share a tall factor stay together.
+
+    Those of no pairs, whose factor costs least again, come last in each share: who is done takes from its end.
+    """
     groups: dict[object, list[str]] = {}
     for name in names:
         method = registry.find_method(name)
@@ -56,15 +59,16 @@ def shares_of(names: Sequence[str], count: int = 2) -> list[list[str]]:
     if len(groups) < count:
         return [list(names[i::count]) for i in range(count)]
 
-    def work(group: Sequence[str]) -> int:  # about seconds with 6558 unknowns: a tall factor, and all sizes of a method
+    def work(group: Sequence[str]) -> tuple[bool, int]:
+        """Pairs, and about seconds with 6558 unknowns: a tall factor, and all sizes of a method."""
         methods = [registry.find_method(name) for name in group]
         several = [method.pairs and method.snapshots for method in methods]  # pairs have twice the columns
-        return 3 * several[0] + 2 * methods[0].snapshots + sum(2 + each for each in several)
+        return several[0], 3 * several[0] + 2 * methods[0].snapshots + sum(2 + each for each in several)
 
     shares: list[list[str]] = [[] for _ in range(count)]
     sums = [0] * count
     for group in sorted(groups.values(), key=work, reverse=True):
         least = sums.index(min(sums))
         shares[least] += group
-        sums[least] += work(group)
+        sums[least] += work(group)[1]
     return shares

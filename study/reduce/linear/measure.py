@@ -261,7 +261,7 @@ def moved(known: dict[Family, ModelComparison], full: FullRun) -> dict[Family, M
     """Comparisons as of :func:`families` with another full run, of the same densities. Collective."""
     system = full.model.system
     places = [each.model.at(system.materials) for each in known.values()]
-    return dict(zip(known, all_at(list(known.values()), places, system, full.snapshots, full.energy), strict=True))
+    return dict(zip(known, all_at(list(known.values()), places, system, full.snapshots), strict=True))
 
 
 def errors_at(

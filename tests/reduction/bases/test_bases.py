@@ -98,8 +98,9 @@ def test_engines_give_one_subspace(key: str, engine: EngineName) -> None:
     c = case()
     size = 8
     first = make_basis(key, c.states, size)
-    # Gram leaves out what is below 6e-8 of the snapshots; pairs feel it over their sigma_k^2 ~ 1e-2
-    tolerance = 1e-4 if engine == "gram" and "svd_like" in key else 1e-7
+    # Gram leaves out what is below 6e-8 of the snapshots; pairs feel it over their sigma_k^2 ~ 1e-2, and vectors joined
+    # from two halves over their sigma_k ~ 1e-2
+    tolerance = 1e-4 if engine == "gram" and key in ("global_pod", "psd_svd_like_fixed") else 1e-7
     assert gap(dense(first), dense(make_basis(key, c.states, size, engine=engine))) < tolerance
 
 
