@@ -43,6 +43,8 @@ class ContactRun(Shown):
     """Outputs y, (steps + 1, components) [m, rad]."""
     force: Array
     """Mean force of each obstacle on the tissue in each step, impulses included, (steps, obstacles, d) [N]."""
+    row_force: Array
+    """The same of each row, along the normal of its obstacle, (steps, rows) [N]."""
     gap: Array
     """Least gap of each obstacle to the nodes of the rows, (steps + 1, obstacles) [m]; < 0 between hat functions."""
     touching: Ints
@@ -166,7 +168,7 @@ class ContactModel(Shown):
             n, offset = plane(obstacle)
             N.append(np.einsum("i,jik->jk", n, self.on_surface.reshape(-1, d, self.N)[self.kept]))
             lift = np.einsum("i,jis->js", n, T)
-            shift, speed = (np.array([np.zeros(d) + f(x) for x in t]) @ n for f in (obstacle.shift, obstacle.rate))
+            shift, speed = (_moved(obstacle, t, order) for order in (0, 1))
             gaps.append(self.X[self.kept] @ n - offset + q @ lift.T - shift[:, None])
             rates.append(v @ lift.T - speed[:, None])
             normals.append(n)
@@ -182,10 +184,12 @@ class ContactModel(Shown):
         self._check(a, q, t, tol)
         least = [(each + a @ n.T).min(axis=1) for each, n in zip(gaps, N, strict=True)]
         ends = np.cumsum([len(H) for H in hats])[:-1]
-        parts = zip(np.split(x + y / dt, ends, axis=1), normals, strict=True)
+        pressed = x + y / dt
+        parts = zip(np.split(pressed, ends, axis=1), normals, strict=True)
         force = np.stack([part.sum(axis=1)[:, None] * n for part, n in parts], axis=1)
         touching = np.column_stack([(part > 0).sum(axis=1) for part in np.split(x, ends, axis=1)])
-        return ContactRun(t, a, rate_a, a @ self.C.T + q @ self.C_s.T, force, np.column_stack(least), touching)
+        outputs = a @ self.C.T + q @ self.C_s.T
+        return ContactRun(t, a, rate_a, outputs, force, pressed, np.column_stack(least), touching)
 
     def _check(self, a: Array, q: Array, t: Array, tol: float) -> None:
         """Raise ModelError where a boundary node without a row is in an obstacle, or any one at the start."""
@@ -194,10 +198,10 @@ class ContactModel(Shown):
         for obstacle in self.obstacles:
             n, offset = plane(obstacle)
             V, T = (np.einsum("i,jik->jk", n, x.reshape(p, d, -1)) for x in (self.on_surface, self.T))
+            shift = _moved(obstacle, t, 0)
             for first in range(0, len(t), CHUNK):
                 part = slice(first, first + CHUNK)
-                shift = np.array([float(n @ (np.zeros(d) + obstacle.shift(x))) for x in t[part]])
-                gap = self.X @ n - offset + a[part] @ V.T + q[part] @ T.T - shift[:, None]
+                gap = self.X @ n - offset + a[part] @ V.T + q[part] @ T.T - shift[part, None]
                 looked = gap[:, others].min(initial=np.inf)
                 if first == 0 and gap[0].min() < -tol:
                     raise ModelError(f"obstacle '{obstacle.name}' is {-gap[0].min():.2g} m in the tissue at the start")
@@ -206,6 +210,12 @@ class ContactModel(Shown):
                         f"a boundary node without a row is {-looked:.2g} m in obstacle '{obstacle.name}'; give "
                         "contact_model a larger reach"
                     )
+
+
+def _moved(obstacle: Obstacle, t: Array, order: int) -> Array:
+    """Displacement of a half-space along its normal at each instant, or its rate, (instants,)."""
+    n, path = plane(obstacle)[0], obstacle.path
+    return np.zeros(len(t)) if path is None else np.array([float(n @ path(x, order)) for x in t])
 
 
 def plane(obstacle: Obstacle) -> tuple[Array, float]:

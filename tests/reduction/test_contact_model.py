@@ -17,10 +17,11 @@ from softgrasp.fem.obstacles import make_obstacles
 from softgrasp.fem.petsc import total
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.contact.hats import hat_functions
-from softgrasp.reduction.contact.make import contact_model
+from softgrasp.reduction.contact.make import contact_model, trained
+from softgrasp.reduction.contact.model import ContactModel
 from softgrasp.reduction.contact.stepper import ContactSteps
 from softgrasp.reduction.system import ModelError
-from tests.helpers.landings import TWICE, drawn_motions, written
+from tests.helpers.landings import drawn_motions, written
 
 TABLE = "obstacle=[{kind='halfspace', name='table', normal=[0, 1], offset=-0.05}]"
 SCENE = ["effects.obstacles=true", "effects.gravity={g=[0, -1]}", "effects.damping={kind='kelvin-voigt', beta=0.005}",
@@ -85,39 +86,51 @@ def test_thirty_columns_are_enough_on_a_fine_mesh(motion: str) -> None:
 
 @pytest.mark.serial
 @pytest.mark.parametrize(
-    ("scene", "cells", "least"),
-    # asked for is 1e-3; measured 1.7e-4 to 2.4e-4, and where the paper's block lands once 6.5e-4 and 7.8e-4, twice
-    # 1.05e-3 and 1.04e-3
+    ("scene", "cells", "count"),
     [
-        ("set_down", "[24, 16]", 1e-3),
+        ("set_down", "[24, 16]", 10),
+        ("paper", "[15, 30]", 10),
         *(
-            pytest.param("set_down", cells, 1e-3, marks=pytest.mark.slow)
-            for cells in ("[12, 8]", "[36, 24]", "[48, 32]")
+            pytest.param(scene, cells, 20, marks=pytest.mark.slow)
+            for scene, cells in (
+                ("set_down", "[24, 16]"), ("set_down", "[48, 32]"), ("paper", "[15, 30]"), ("paper", "[60, 120]"),
+            )
         ),
-        ("paper", "[15, 30]", 1.2e-3),
-        pytest.param("paper", "[60, 120]", 1.2e-3, marks=pytest.mark.slow),
     ],
-)
-def test_motions_that_chose_no_setting_are_repeated(scene: str, cells: str, least: float, tmp_path: Path) -> None:
-    def built(*motion: str) -> Model:
+)  # fmt: skip
+def test_motions_that_chose_no_setting_are_repeated(scene: str, cells: str, count: int, tmp_path: Path) -> None:
+    def built(start: str, *motion: str) -> Model:
+        of_time = [f"tissue.cells={cells}", f"time.start='{start}'"]
         if scene == "paper":
-            return landing(*LONG, *(motion or (MADE,)), f"tissue.cells={cells}")
-        return build("set_down", ["output.snapshots='memory'", f"tissue.cells={cells}", *motion], MPI.COMM_SELF)
+            return landing(*LONG, *(motion or (MADE,)), *of_time)
+        return build("set_down", ["output.snapshots='memory'", *of_time, *motion], MPI.COMM_SELF)
 
-    rom = contact_model(built(), N=30)
-    found = []
-    for i, table in enumerate(
-        drawn_motions(*(((0.5, -0.12), 2.0, 3.0) if scene == "paper" else ((0.02, -0.02), 0.5, 0.9)))
-    ):
-        full = simulate(built(*written(table, tmp_path, f"drawn_{i}")))
+    sizes = (30,) if scene == "set_down" else (42, 30)
+    models: dict[str, dict[int, ContactModel]] = {"equilibrium": {}, "rest": {}}
+    for start, made in models.items():
+        training = trained(built(start))
+        made.update((N, training.model(N)) for N in sizes)
+    found: dict[int, list[tuple[float, float]]] = {N: [] for N in sizes}
+    motions = drawn_motions(*(((0.5, -0.12), 2.0, 3.0) if scene == "paper" else ((0.02, -0.02), 0.5, 0.9)), count)
+    for i, (kind, table) in enumerate(motions):
+        start = "rest" if i % 5 == 4 else "equilibrium"
+        full = simulate(built(start, *written(table, tmp_path, f"drawn_{i}")))
         assert full.contact is not None
         assert (full.contact.touching > 0).any()
-        found.append(errors(full, rom.run(full.q_s, full.v_s, rom.dt), rom.V, MPI.COMM_SELF))
-    once, twice = np.array(found[:-TWICE]).max(axis=0), np.array(found[-TWICE:]).max(axis=0)
-    sys.stdout.write(f"{scene} {cells}, z and force: landing once {once}, twice {twice}\n")
-    assert once[0] < 1e-3  # asked for
-    assert twice[0] < least
-    assert max(once[1], twice[1]) < 1e-2  # asked for; measured at most 4.7e-3 and 9.8e-3, on the finest set_down
+        for N, rom in models[start].items():
+            run = rom.run(full.q_s, full.v_s, rom.dt)
+            found[N].append(errors(full, run, rom.V, MPI.COMM_SELF))
+            z, force = found[N][-1]
+            sys.stdout.write(f"{scene} {cells}, N = {N}, {kind} from {start}: z {z:.2e}, force {force:.2e}\n")
+    for N, each in found.items():
+        missed = sum(z > 1e-3 or force > 1e-2 for z, force in each)
+        largest, median = np.max(each, axis=0), np.median(each, axis=0)
+        sys.stdout.write(
+            f"{scene} {cells}, N = {N}: largest {largest}, median {median}, missed by {missed} of {count}\n"
+        )
+    each = np.array(found[sizes[0]])
+    assert each[:, 0].max() < 1e-3  # asked for
+    assert each[:, 1].max() < 1e-2  # asked for
 
 
 @pytest.mark.serial

@@ -12,17 +12,14 @@ from softgrasp.fem import Model, SolverError, simulate
 from softgrasp.reduction import FullRun, ModelError, ReductionError, full_run
 from softgrasp.reduction.contact.make import check_contact_scene, trained
 from softgrasp.reduction.contact.model import ContactModel, ContactRun, plane
+from softgrasp.reduction.contact.motions import ASIDE, tangent
 from softgrasp.reduction.contact.replay import errors_contact, replay_contact
-from softgrasp.reduction.contact.train import directions, tangent
 from softgrasp.reduction.parameters import moved_to
 from softgrasp.study.reduce.times import FullTimes, Say
 from softgrasp.study.shell import median_processor_seconds
 
-NUMBERS = (38, 30, 22)  # columns in 2D unless the scene names N
-BESIDE = (20, 14, 5)  # columns in 3D beside those of the hand and of all nodes within reach then
 RUNS = 9  # behind each median of the time of a run
 DEEP, DEEPER = 1.05, 1.15  # ways of held-out motions towards the first obstacle, over that of the scene
-ASIDE = 0.5  # way along it over that towards it, where the motion of the scene has none
 
 
 @dataclass(frozen=True)
@@ -155,13 +152,9 @@ def _models(model: Model, refused: dict[str, str], say: Say) -> dict[str, Contac
     options, models = model.scene.reduction, dict[str, ContactModel]()
     say("reduced model", 0, 1)
     training = trained(model)
-    nodes, hand = len(training.rich.kept), training.rich.G.shape[1]
-    if "N" in options.model_fields_set:
-        numbers = sorted(set(options.N), reverse=True)
-    elif model.system.layout.dimension == 2:
-        numbers = list(NUMBERS)
-    else:
-        numbers = [hand + directions(training.rich.obstacles) * nodes + more for more in BESIDE]
+    nodes = len(training.rich.kept)
+    given = "N" in options.model_fields_set
+    numbers = sorted(set(options.N), reverse=True) if given else training.numbers
     for i, N in enumerate(numbers):
         say("reduced model", i, len(numbers))
         try:
