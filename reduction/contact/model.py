@@ -144,8 +144,16 @@ class ContactModel(Shown):
         return self.table.q, self.table.v
 
     def check_scene(self, keys: Mapping[str, Any]) -> None:
-        """Refuse the keys of a scene that differs in more than motion and time. Raises ModelError: names the key."""
+        """Refuse the keys of a scene that differs in more than motion and time, or starts otherwise.
+
+        Raises ModelError: names the key.
+        """
         check_origin(self.origin, keys, "contact model", (MOTION,))
+        own, other = (each.get("time.start") for each in (self.origin, keys))
+        if self.origin and own != other:
+            raise ModelError(
+                f"the model was built with time.start = '{own}', and the scene has '{other}'; reduce it too"
+            )
 
     def run(self, q: Array, v: Array, dt: float, engine: str = "") -> ContactRun:
         """Midpoint steps with contact under a motion of the hand. Not collective.

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -107,13 +108,8 @@ class Training:
         fixed = np.hstack([rich.G, *(responses[j] for j in each)]) / rich.stiffness[:, None]
         weight = rich.stiffness[:, None] ** (POWER / 2)
         B = np.linalg.qr(weight * fixed / np.linalg.norm(weight * fixed, axis=0))[0]
-        gram = np.zeros((rich.N, rich.N))
-        for motion, run in self.runs:
-            for x, share in ((run.a, 1.0), (run.v, SPEED)):
-                part = weight * x.T
-                size = float(np.linalg.norm(part))
-                part -= B @ (B.T @ part)
-                gram += _weight(motion) * share**2 * (part @ part.T) / (size or 1.0) ** 2
+        P = np.eye(rich.N) - B @ B.T
+        gram = P @ self._gram @ P
         free = max(0, N - fixed.shape[1])
         needed = np.linalg.eigh(gram)[1][:, ::-1][:, :free] / weight
         X = np.hstack([fixed, needed])
@@ -121,6 +117,16 @@ class Training:
         for share in (DEPENDENT, 0.0):  # twice, for orthonormality to rounding
             X = X @ normalising(X.T @ X, share)
         return np.asarray(X @ np.linalg.eigh(X.T @ (rich.stiffness[:, None] * X))[1])
+
+    @cached_property
+    def _gram(self) -> Array:
+        """Sum over the runs of c x x', x = W^(1/2) a and SPEED W^(1/2) v, each over its norm, (rich N, rich N)."""
+        weight, gram = self.rich.stiffness[:, None] ** (POWER / 2), np.zeros((self.rich.N, self.rich.N))
+        for motion, run in self.runs:
+            for x, share in ((run.a, 1.0), (run.v, SPEED)):
+                part = weight * x.T
+                gram += _weight(motion) * share**2 * (part @ part.T) / (float(np.linalg.norm(part)) or 1.0) ** 2
+        return gram
 
     def _error(self, small: ContactModel, Q: Array, least: float) -> float:
         """Error on the motions in the mean of squares, inf above ``least`` [1].
