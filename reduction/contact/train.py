@@ -26,7 +26,7 @@ from softgrasp.reduction.contact.model import ContactModel, ContactRun, plane
 from softgrasp.reduction.contact.motions import Motion, training_motions
 from softgrasp.reduction.system import ModelError
 
-# Those up to FORCE, and the motions, were chosen on motions drawn from other seeds than those of docs/guide.
+# These up to FORCE, and the motions, were chosen on motions from other seeds than that of the errors in docs/guide.
 POWER = 0.5  # of the stiffness in W [1]
 SPEED = 0.03  # of the rates beside the positions, both over their norms [1]
 LANDING = 10.0  # c of motions that only land, whose waves are the fastest and weigh in the forces; of others 1 [1]
