@@ -9,10 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import combinations
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from softgrasp.fem.compiled import functions, packed
 from softgrasp.fem.errors import MeshError
 from softgrasp.fem.shown import counted
 
@@ -22,7 +25,12 @@ Ints = npt.NDArray[np.int32]  # numbers and marks as DOLFINx has them
 Flags = npt.NDArray[np.bool_]
 
 MOST_PAIRS = 500_000  # of balls and points that are compared one by one [1], 12 MB: the tree is slow to import
+ALONG = np.array([1.0, 2**0.5, 3**0.5])  # few nodes have the same place in this direction, those of lattices neither
 FLAT = 1e-12  # volume over (longest edge)^d: far above round-off (1e-16), far below any usable cell
+
+
+def _compiled() -> Any:
+    return functions(Path(__file__).with_name("skin.c"), "meshes are checked by NumPy, more slowly")
 
 
 def signed_volumes(points: Floats, cells: Integers) -> Floats:
@@ -49,6 +57,11 @@ def longest_edges(points: Floats, cells: Integers) -> Floats:
 
 def quality(points: Floats, cells: Integers) -> Floats:
     """Signed volume of each simplex over (longest edge)^d [1]: at most `FLAT` in size if flat, negative if inverted."""
+    if (code := _compiled()) is not None:
+        x, nodes = np.ascontiguousarray(points), np.ascontiguousarray(cells, dtype=np.int64)
+        shape = np.empty(len(nodes))
+        code.softgrasp_skin(packed(len(nodes), x.shape[1], nodes, x, shape, None))
+        return shape
     volumes, edges = signed_volumes(points, cells), longest_edges(points, cells)
     return np.asarray(np.divide(volumes, edges ** points.shape[1], out=np.zeros_like(volumes), where=edges != 0))
 
@@ -145,21 +158,49 @@ class Facets:
         return self.cells[:-1][self.same], self.cells[1:][self.same]
 
 
-def sort_facets(cells: Integers) -> Facets:
-    """The facets of simplices, shape (n_cells, d + 1)."""
+def sort_facets(cells: Integers, among: Flags | None = None) -> Facets:
+    """The facets of simplices, shape (n_cells, d + 1); with ``among`` those whose nodes all have this flag."""
     n, corners = cells.shape
-    nodes = np.sort(np.concatenate([np.delete(cells, i, axis=1) for i in range(corners)]), axis=1)
+    nodes, owners = np.concatenate([np.delete(cells, i, axis=1) for i in range(corners)]), np.arange(n * corners) % n
+    if among is not None:
+        kept = among[nodes].all(axis=1)
+        nodes, owners = nodes[kept], owners[kept]
+    nodes = np.sort(nodes, axis=1)
     order = np.lexsort(nodes.T)
     nodes = nodes[order]
-    return Facets(nodes, order % n, (nodes[1:] == nodes[:-1]).all(axis=1))
+    return Facets(nodes, owners[order], (nodes[1:] == nodes[:-1]).all(axis=1))
+
+
+def outer_facets(cells: Integers, n_points: int) -> Facets:
+    """Those of :func:`sort_facets` whose nodes all lie on the boundary, all outer ones among them.
+
+    Each facet adds a number, which its nodes alone decide, to those of its nodes by exclusive or: the numbers of a
+    facet between two cells cancel, so that nothing is left at a node inside.
+    """
+    if (code := _compiled()) is None:
+        return sort_facets(cells)
+    nodes, fold = np.ascontiguousarray(cells, dtype=np.int64), np.zeros(n_points, dtype=np.uint64)
+    d = nodes.shape[1] - 1
+    code.softgrasp_skin(packed(len(nodes), d, nodes, None, None, fold))
+    on = fold != 0
+    some = np.flatnonzero(np.count_nonzero(on[cells], axis=1) >= d)
+    sides = sort_facets(cells[some], on)
+    return Facets(sides.nodes, some[sides.cells], sides.same)
 
 
 def _within(points: Floats, middles: Floats, radii: Floats) -> tuple[Integers, Integers]:
     """Numbers of a ball and of a point in it, for all pairs of both."""
-    if len(points) * len(middles) <= MOST_PAIRS:
-        squares = ((middles[:, None] - points) ** 2).sum(axis=2)
-        ball, point = np.nonzero(squares <= radii[:, None] ** 2)
-        return ball, point
+    along = ALONG[: points.shape[1]]
+    at, places = points @ along, middles @ along
+    order = np.argsort(at, kind="stable")
+    reach = radii * (np.linalg.norm(along) * (1 + 1e-9)) + 1e-14 * np.abs(at).max(initial=0.0)  # and rounding
+    begin = np.searchsorted(at[order], places - reach)
+    count = np.searchsorted(at[order], places + reach, side="right") - begin
+    if count.sum() <= MOST_PAIRS:
+        ball = np.repeat(np.arange(len(middles)), count)
+        point = order[np.arange(len(ball)) + np.repeat(begin - np.cumsum(count) + count, count)]
+        inside = ((middles[ball] - points[point]) ** 2).sum(axis=1) <= radii[ball] ** 2
+        return ball[inside], point[inside]
     from scipy.spatial import cKDTree  # slow to import
 
     lists = cKDTree(points).query_ball_point(middles, radii)

@@ -25,7 +25,6 @@ from softgrasp.fem.mesh.cells import (
 )
 from softgrasp.fem.mesh.check import (
     SEAM,
-    Facets,
     Flags,
     Floats,
     Integers,
@@ -33,6 +32,7 @@ from softgrasp.fem.mesh.check import (
     check_cells,
     doubled_nodes,
     doubled_text,
+    outer_facets,
     sort_facets,
 )
 from softgrasp.fem.mesh.foreign import read_foreign
@@ -149,30 +149,28 @@ def load_body(path: Path, scale: float, limit: float | None = None) -> Body:
 
 def checked(body: Body, repair: bool, seam: float = SEAM) -> MeshArrays:
     """The arrays of a body that is one. Raises MeshError: see `read_mesh`."""
-    body, sides = mended(body, seam, repair)
+    body = mended(body, seam, repair)
     known: dict[str, Any] = {"source": body.path.name, "notes": body.notes, "digest": body.digest}
     known |= {"facet_sets": body.facet_sets, "cell_sets": body.cell_sets}
     own = body.points, body.cells, body.cell_tags
-    return inspected(own, (body.facets, body.facet_tags), sides, known, seam, str(body.path))
+    return inspected(own, (body.facets, body.facet_tags), sort_facets(body.cells), known, seam, str(body.path))
 
 
-def mended(body: Body, seam: float, repair: bool = True) -> tuple[Body, Facets]:
+def mended(body: Body, seam: float, repair: bool = True) -> Body:
     """The body with inverted cells turned round and doubled nodes joined, if it may be, or notes of these.
 
     Raises MeshError: see `read_mesh`.
     """
     points, facets, facet_tags, name = body.points, body.facets, body.facet_tags, str(body.path)
     cells = check_cells(points, body.cells, repair, name)
-    sides = sort_facets(cells)
-    first = doubled_nodes(points, cells, sides, seam)
+    first = doubled_nodes(points, cells, outer_facets(cells, len(points)), seam)
     notes = (*body.notes, *doubled_text(points, first, seam, repair, name))
     if repair and notes:
         used, number = np.unique(first, return_inverse=True)
         points, cells = points[used], check_cells(points[used], number[cells], False, name)
         _, sole = np.unique(np.sort(number[facets], axis=1), axis=0, return_index=True)  # one of both sides of a seam
         facets, facet_tags = number[facets][sole], None if facet_tags is None else facet_tags[sole]
-        sides = sort_facets(cells)
-    return replace(body, points=points, cells=cells, facets=facets, facet_tags=facet_tags, notes=notes), sides
+    return replace(body, points=points, cells=cells, facets=facets, facet_tags=facet_tags, notes=notes)
 
 
 def _read(path: Path, limit: float | None) -> meshio.Mesh:

@@ -55,7 +55,7 @@ def file_copy(scene: Scene, comm: MPI.Intracomm) -> tuple[Copy | None, TissueMes
         if comm.rank == 0:
             body = load_body(scene.directory / str(tissue.mesh), tissue.scale, tissue.read_limit)
             if _large(body, tissue.order):
-                body = mended(body, tissue.seam)[0] if tissue.repair else body
+                body = mended(body, tissue.seam) if tissue.repair else body
                 arrays, outline = _lattice(scene, body)
             arrays = arrays or checked(body, tissue.repair, tissue.seam)
     mesh, outline = spread(comm, arrays), comm.bcast(outline)

@@ -12,7 +12,7 @@ from scipy.sparse import coo_array, csgraph
 
 from softgrasp.fem.errors import MeshError
 from softgrasp.fem.mesh import check
-from softgrasp.fem.mesh.check import doubled_nodes, place_text, sort_facets
+from softgrasp.fem.mesh.check import doubled_nodes, outer_facets, place_text, quality, sort_facets
 from softgrasp.fem.mesh.file import read_mesh
 from softgrasp.fem.model.contact import cells_in, contact_facets, held_check
 from tests.fem.mesh.test_mesh import COMM, WIDE, area, grid, volume, write, zone
@@ -97,6 +97,36 @@ def test_many_copies_of_a_node_are_one_place(pairs: int, monkeypatch: pytest.Mon
     first = doubled_nodes(points[cells.ravel()], apart, sort_facets(apart), 1e-4)
     assert len(np.unique(first)) == len(points)
     assert np.array_equal(points[cells.ravel()], points[cells.ravel()][first])
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("tip", [-1.0, 0.25, 2.0])
+def test_the_boundary_is_found_without_sorting_all_facets(dimension: int, tip: float) -> None:
+    """Against all facets sorted: a box torn apart, half or whole; and one facet of three cells, which is no end."""
+    points, cells, _ = torn(dimension, 6, tip)
+    everything, few = sort_facets(cells), outer_facets(cells, len(points))
+    assert np.array_equal(few.nodes[few.outer], everything.nodes[everything.outer])
+    assert np.array_equal(few.cells[few.outer], everything.cells[everything.outer])
+    assert len(few.nodes) < len(everything.nodes)
+    inner = np.flatnonzero(everything.same)[0]
+    third = np.append(everything.nodes[inner], len(points))
+    crowded = outer_facets(np.vstack([cells, third]), len(points) + 1)
+    assert not (crowded.nodes[crowded.outer] == everything.nodes[inner]).all(axis=1).any()
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_shapes_of_cells_are_those_of_determinants(dimension: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compiled, against NumPy's determinants; nan where a corner is, zero where all are one."""
+    random = np.random.default_rng(3)
+    points, cells = random.normal(size=(60, dimension)), random.integers(1, 60, (500, dimension + 1))
+    points[0] = np.nan
+    cells[0], cells[1, 0] = 5, 0
+    shape = quality(points, cells)
+    monkeypatch.setattr(check, "_compiled", lambda: None)
+    np.testing.assert_allclose(shape, quality(points, cells), rtol=0, atol=1e-14)  # sums of three products
+    assert (shape[0], np.isnan(shape[1])) == (0, True)
 
 
 @pytest.mark.serial
