@@ -171,21 +171,33 @@ def sort_facets(cells: Integers, among: Flags | None = None) -> Facets:
     return Facets(nodes, owners[order], (nodes[1:] == nodes[:-1]).all(axis=1))
 
 
-def outer_facets(cells: Integers, n_points: int) -> Facets:
-    """Those of :func:`sort_facets` whose nodes all lie on the boundary, all outer ones among them.
+def on_boundary(cells: Integers, n_points: int) -> Flags:
+    """Whether nodes lie on facets that bound one cell, or another odd number, (n_points,); all without compiled code.
 
     Each facet adds a number, which its nodes alone decide, to those of its nodes by exclusive or: the numbers of a
     facet between two cells cancel, so that nothing is left at a node inside.
     """
     if (code := _compiled()) is None:
-        return sort_facets(cells)
+        return np.ones(n_points, dtype=np.bool_)
     nodes, fold = np.ascontiguousarray(cells, dtype=np.int64), np.zeros(n_points, dtype=np.uint64)
-    d = nodes.shape[1] - 1
-    code.softgrasp_skin(packed(len(nodes), d, nodes, None, None, fold))
-    on = fold != 0
-    some = np.flatnonzero(np.count_nonzero(on[cells], axis=1) >= d)
+    code.softgrasp_skin(packed(len(nodes), nodes.shape[1] - 1, nodes, None, None, fold))
+    return np.asarray(fold != 0)
+
+
+def outer_facets(cells: Integers, n_points: int) -> Facets:
+    """Those of :func:`sort_facets` whose nodes all lie on the boundary, all outer ones among them."""
+    on = on_boundary(cells, n_points)
+    some = with_nodes(cells, on, cells.shape[1] - 1)
     sides = sort_facets(cells[some], on)
     return Facets(sides.nodes, some[sides.cells], sides.same)
+
+
+def with_nodes(cells: Integers, flags: Flags, least: int) -> Integers:
+    """Numbers of the cells that have so many of the flagged nodes or more."""
+    count = flags[cells[:, 0]].astype(np.int8)
+    for nodes in cells.T[1:]:
+        count += flags[nodes]
+    return np.flatnonzero(count >= least)
 
 
 def _within(points: Floats, middles: Floats, radii: Floats) -> tuple[Integers, Integers]:

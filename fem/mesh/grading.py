@@ -122,7 +122,11 @@ class SizeField:
 
     def __call__(self, x: Floats) -> Floats:
         """Size at points (n, d), (n,) [m]."""
-        r = np.minimum(self.ends.distance(x), self.radius)
+        return self.at_distance(self.ends.distance(x))
+
+    def at_distance(self, r: Floats) -> Floats:
+        """Size at distances from the nearest end, (n,) [m]."""
+        r = np.minimum(r, self.radius)
         return np.maximum(self.h0 * (r / self.radius) ** (1 - self.mu), min(self.smallest, self.h0))
 
 

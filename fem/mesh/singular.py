@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from softgrasp.fem.mesh.check import Flags, Floats, Integers, sort_facets
+from softgrasp.fem.mesh.check import Flags, Floats, Integers, on_boundary, sort_facets, with_nodes
 
 Kind = Literal["contact end", "re-entrant", "held corner", "layer end"]
 
@@ -125,24 +125,24 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
         nu: Poisson's ratio of each cell [1], shape (n_cells,).
     """
     d = points.shape[1]
-    facets = sort_facets(cells)
+    on = on_boundary(cells, len(points)) | _between(cells, layers, len(points))
+    some = with_nodes(cells, on, d - 1)  # all that meet at a vertex or edge of the boundary or between layers
+    cells, layers, nu = cells[some], layers[some], nu[some]
+    facets = sort_facets(cells, on)
     outer, (one, other) = facets.nodes[facets.outer], facets.pairs
     between = facets.nodes[:-1][facets.same][layers[one] != layers[other]]
     code = np.array([len(points) ** k for k in range(d)], dtype=np.int64)
     clamped = np.isin(outer @ code, np.sort(held, axis=1) @ code)
-    ridges, angle = _angles(points, cells)
+    ridges, angle, ratio = _ridges(points, cells, nu, on)
     parts = {"held": outer[clamped], "free": outer[~clamped], "inner": between}
-    on = {name: _per_ridge(part, ridges, d) for name, part in parts.items()}
-    ratio = np.zeros(len(ridges))
-    for corner in combinations(range(d + 1), d - 1):
-        np.maximum.at(ratio, _find(ridges, np.sort(cells[:, list(corner)], axis=1)), nu)
+    at_ridges = {name: _per_ridge(part, ridges, d) for name, part in parts.items()}
     chosen: list[int] = []
     alphas: list[float] = []
     kinds: list[Kind] = []
-    boundary = on["held"] + on["free"] > 0
-    odd = boundary & ((on["held"] > 0) | (np.abs(angle - np.pi) > STRAIGHT))
+    boundary = at_ridges["held"] + at_ridges["free"] > 0
+    odd = boundary & ((at_ridges["held"] > 0) | (np.abs(angle - np.pi) > STRAIGHT))
     at = np.flatnonzero(odd)
-    sides = np.where(on["held"][at] == 0, 0, np.where(on["free"][at] == 0, 2, 1))
+    sides = np.where(at_ridges["held"][at] == 0, 0, np.where(at_ridges["free"][at] == 0, 2, 1))
     keys = np.column_stack([np.round(angle[at] * 1e4), np.round(ratio[at] * 1e6), sides])
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     one = at[first]
@@ -152,13 +152,25 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
             chosen.append(i)
             alphas.append(a)
             kinds.append(KINDS[side])
-    for i in np.flatnonzero(_layer_ends(points, between, ridges, on["inner"], boundary, d)).tolist():
-        if i not in chosen:
-            chosen.append(i)
-            alphas.append(0.5)
-            kinds.append("layer end")
+    others = np.flatnonzero(_layer_ends(points, between, ridges, at_ridges["inner"], boundary, d))
+    others = others[~np.isin(others, chosen)]
+    chosen += others.tolist()
+    alphas += [0.5] * len(others)
+    kinds += ["layer end"] * len(others)
     index = np.array(chosen, dtype=np.int64)
     return Ends(points[ridges[index]].reshape(-1, d - 1, d), angle[index], np.array(alphas), tuple(kinds))
+
+
+def _between(cells: Integers, layers: Integers, n_points: int) -> Flags:
+    """Whether nodes belong to cells of several layers, (n_points,)."""
+    if (layers == layers[:1]).all():
+        return np.zeros(n_points, dtype=np.bool_)
+    count = np.zeros(n_points, dtype=np.int64)
+    for layer in np.unique(layers):
+        touched = np.zeros(n_points, dtype=np.bool_)
+        touched[cells[layers == layer]] = True
+        count += touched
+    return count > 1
 
 
 def _find(ridges: Integers, rows: Integers) -> Integers:
@@ -172,11 +184,13 @@ def _codes(rows: Integers, n: int) -> Integers:
     return np.asarray(rows @ np.array([n**k for k in reversed(range(rows.shape[1]))], dtype=np.int64))
 
 
-def _angles(points: Floats, cells: Integers) -> tuple[Integers, Floats]:
-    """All vertices (2D) or edges (3D), (ridges, d - 1), and the sum of the cells' angles there [rad], (ridges,)."""
-    d = points.shape[1]
-    rows, values = [], []
+def _ridges(points: Floats, every: Integers, nu: Floats, on: Flags) -> tuple[Integers, Floats, Floats]:
+    """Vertices (2D) or edges (3D) of flagged nodes, (ridges, d - 1), sum of angles there [rad], greatest nu."""
+    d, flags = points.shape[1], on[every]
+    rows, values, ratios = [], [], []
     for corner in combinations(range(d + 1), d - 1):
+        here = flags[:, list(corner)].all(axis=1)
+        cells = every[here]
         others = [i for i in range(d + 1) if i not in corner]
         a, b = (points[cells[:, i]] - points[cells[:, corner[0]]] for i in others)
         if d == 3:  # dihedral angle: both arms at right angles to the edge
@@ -186,10 +200,12 @@ def _angles(points: Floats, cells: Integers) -> tuple[Integers, Floats]:
         cosine = np.einsum("ij,ij->i", a, b) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
         rows.append(np.sort(cells[:, list(corner)], axis=1))
         values.append(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    every = np.concatenate(rows)
-    _, first, inverse = np.unique(_codes(every, len(points)), return_index=True, return_inverse=True)
-    ridges = every[first]
-    return ridges, np.bincount(inverse, weights=np.concatenate(values), minlength=len(ridges))
+        ratios.append(nu[here])
+    corners = np.concatenate(rows)
+    _, first, inverse = np.unique(_codes(corners, len(points)), return_index=True, return_inverse=True)
+    ratio = np.zeros(len(first))
+    np.maximum.at(ratio, inverse, np.concatenate(ratios))
+    return corners[first], np.bincount(inverse, weights=np.concatenate(values), minlength=len(first)), ratio
 
 
 def _per_ridge(facets: Integers, ridges: Integers, d: int) -> Integers:

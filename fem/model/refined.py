@@ -7,6 +7,7 @@ with r the distance from the nearest end of the contact zone, re-entrant corner 
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -16,7 +17,8 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError, raise_on_all_ranks
-from softgrasp.fem.mesh.check import longest_edges, sort_facets
+from softgrasp.fem.mesh.bisected import bisected_count
+from softgrasp.fem.mesh.check import Floats, Integers, longest_edges, sort_facets
 from softgrasp.fem.mesh.grading import (
     BISECTION,
     LINES,
@@ -46,6 +48,7 @@ LINES_ACROSS = {2: {1: 24.0, 2: 8.0, 3: 5.0}, 3: {1: 16.0, 2: 6.0, 3: 4.0}}
 # Smallest cell over tolerance times shortest side: the cells at an end are about proportional to it.
 SMALLEST = {2: {1: 0.1, 2: 0.4, 3: 1.0}, 3: {1: 16.0, 2: 48.0, 3: 96.0}}
 DEEPEST = {2: 1 / 256, 3: 1 / 8}  # smallest over largest cell without a tolerance: edges in 3D fill a body quickly
+MEDIAN_OF = 20_000  # cells that give the median of their edges where cells are counted on a sample, about
 SHRINK = 1.25  # of the tolerance, from mesh to mesh, until the unknowns fit
 
 
@@ -97,10 +100,10 @@ def _lined(comm: MPI.Intracomm, scene: Scene, refine: Refine, goal: float | None
             if lattice(cells, p) <= refine.most:
                 break
             if across <= 1:
-                raise _too_large(refine, lattice(cells, p))
+                raise too_large(refine, lattice(cells, p))
             across = max(across / 1.1, 1.0)
     elif lattice(cells, p) > refine.most:
-        raise _too_large(refine, lattice(cells, p))
+        raise too_large(refine, lattice(cells, p))
     return box_of_lines(comm, scene, cells, mu, short / 2)
 
 
@@ -110,12 +113,12 @@ def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
     while True:
         whole = _base(scene, refine, aim)
         if unknowns(whole, order) > refine.most and (aim is None or aim > 1):
-            raise _too_large(refine, unknowns(whole, order))
+            raise too_large(refine, unknowns(whole, order))
         whole = graded(whole, scene, refine, aim)
         if unknowns(whole, order) <= refine.most:
             break
         if aim is None:
-            raise _too_large(refine, unknowns(whole, order))
+            raise too_large(refine, unknowns(whole, order))
         aim *= SHRINK
     if refine.contact == "inherit":
         return whole
@@ -151,28 +154,66 @@ def marked(tissue: TissueMesh, scene: Scene) -> Whole:
 
 def ends_of(whole: Whole, scene: Scene) -> Ends:
     """Singular ends of a marked mesh."""
-    materials = [*(layer.material for layer in scene.tissue.layers.values()), scene.tissue.material]
     number = whole.cells["layers"].astype(np.int64)
-    nu = np.array([m.nu for m in materials])[number]
-    return singular_ends(whole.points, whole.simplices, whole.facet_nodes("contact"), number, nu)
+    return ends_at(scene, (whole.points, whole.simplices), whole.facet_nodes("contact"), number)
+
+
+def ends_at(scene: Scene, mesh: tuple[Floats, Integers], held: Integers, layers: Integers) -> Ends:
+    """Singular ends of a mesh of points and cells, with its contact facets and the number of each cell's layer."""
+    materials = [*(layer.material for layer in scene.tissue.layers.values()), scene.tissue.material]
+    return singular_ends(*mesh, held, layers, np.array([m.nu for m in materials])[layers])
 
 
 def graded(whole: Whole, scene: Scene, refine: Refine, aim: float | None) -> Whole:
     """Bisect until the cells have their a-priori sizes."""
-    points, d = whole.points, whole.dimension
     if refine.grading == "off":
         return whole
-    short = float(np.ptp(points, axis=0).min())
+    lengths = _lengths(whole.points, whole.simplices)
+    return bisect_to(whole, size_field(scene, refine, aim, ends_of(whole, scene), lengths), SLACK, refine.most)
+
+
+def _lengths(points: Floats, cells: Integers) -> tuple[float, float]:
+    """Shortest side of the box around a body, and median of the longest edges of its cells [m]."""
+    return float(np.ptp(points, axis=0).min()), float(np.median(longest_edges(points, cells)))
+
+
+def size_field(scene: Scene, refine: Refine, aim: float | None, ends: Ends, lengths: tuple[float, float]) -> SizeField:
+    """The a-priori sizes of cells. ``lengths``: of :func:`_lengths`."""
+    (short, h0), d, order = lengths, ends.at.shape[2], scene.tissue.order
+    p = min(order, 3)
     if aim is None:
-        edges = longest_edges(points, whole.simplices)
-        p = min(scene.tissue.order, 3)
         mu = BISECTION[p] if refine.grading == "auto" else refine.grading
-        h0 = float(np.median(edges))
-        sizes = SizeField(ends_of(whole, scene), h0, max(short / 2, h0), mu, DEEPEST[d] * h0)
-    else:
-        across, mu, smallest = aims(refine, scene.tissue.order, d, aim)
-        sizes = SizeField(ends_of(whole, scene), np.sqrt(d) * short / across, short / 2, mu, smallest * short)
-    return bisect_to(whole, sizes, SLACK, refine.most)
+        assert isinstance(mu, float)  # graded meshes only
+        return SizeField(ends, h0, max(short / 2, h0), mu, DEEPEST[d] * h0)
+    across, mu, smallest = aims(refine, order, d, aim)
+    return SizeField(ends, np.sqrt(d) * short / across, short / 2, mu, smallest * short)
+
+
+def sampled_cells(scene: Scene, refine: Refine, ends: Ends, base: tuple[Floats, Integers], each: float) -> float:
+    """About how many cells the bisected mesh has, see :func:`bisected_count`.
+
+    Args:
+        ends: singular ends of the body.
+        base: points (n, d) [m] and cells (m, d + 1) of the mesh to bisect.
+        each: unknowns a cell [1].
+    """
+    points, cells = base
+    if refine.grading == "off":
+        return float(len(cells))
+    lengths = _lengths(points, cells[:: max(len(cells) // MEDIAN_OF, 1)])
+
+    def count(shrunk: int) -> float:
+        aim = None if refine.tolerance is None else refine.tolerance * SHRINK**shrunk
+        return bisected_count(points, cells, size_field(scene, refine, aim, ends, lengths))
+
+    found = count(0)
+    if refine.tolerance is None or each * found <= refine.most:
+        return found
+    low, high = 0, math.ceil(math.log(1 / refine.tolerance, SHRINK))  # too fine, and as coarse as may be
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if each * count(middle) <= refine.most else (middle, high)
+    return count(high)
 
 
 def unknowns(whole: Whole, order: int) -> int:
@@ -192,7 +233,8 @@ def lattice(cells: list[int], order: int) -> int:
     return len(cells) * int(np.prod([order * n + 1 for n in cells]))
 
 
-def _too_large(refine: Refine, count: int) -> SceneError:
+def too_large(refine: Refine, count: int) -> SceneError:
+    """The error of a mesh of so many unknowns."""
     return SceneError(
         f"tissue.refine.most = {refine.most} unknowns are fewer than the {count} of the coarsest mesh that "
         "[tissue.refine] allows; raise it, or use larger cells or a lower tissue.order."

@@ -235,14 +235,21 @@ def first_horizon(model: Model, plant: RiccatiProblem) -> int:
     return max(1, int(np.ceil(SETTLED / (slowest * given.grid))))
 
 
-def plan_sizes(model: Model) -> PlanSizes | None:
-    """Variables and rows of the plan before it is made; None where the scene has none. Collective."""
+def plan_sizes(model: Model, boundary: int | None = None) -> PlanSizes | None:
+    """Variables and rows of the plan before it is made; None where the scene has none. Collective.
+
+    ``boundary``: nodes on the boundary of the mesh that the model is a coarser copy of; None: the model is no copy.
+    """
     given = control_of(model).constraints
     if given is None:
         return None
     plant = problem(model)
     steps, n_s = first_horizon(model, plant), plant.layout.n_s
-    gaps = len(model.scene.obstacle or []) * (given.parts + 1) * len(body_surface(model).keeping().nodes)
+    if boundary is None:
+        nodes = len(body_surface(model).keeping().nodes)
+    else:
+        nodes = boundary if given.body == "boundary" else len(given.body)
+    gaps = len(model.scene.obstacle or []) * (given.parts + 1) * nodes
     hand = 2 * n_s * sum(limit is not None for limit in (given.force, given.speed, given.jump))
     return PlanSizes(given.N, steps, given.grid, n_s * steps, steps * (gaps + hand))
 

@@ -10,11 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
+import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem import Scene
 from softgrasp.fem.accuracy.price import fewer_lines
 from softgrasp.fem.errors import MeshError, SceneError
+from softgrasp.fem.mesh.singular import Ends
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.assembly import discretise
 from softgrasp.fem.model.build import Model, build
@@ -30,6 +32,8 @@ NOT_ASSEMBLED = (
     "So large a mesh is not assembled here: modes, sag, places of outputs and what follows from them are those of "
 )
 
+SAMPLED = {2: "to about 5 %", 3: "to about 20 %"}  # exactness of counts on a sample, by dimension
+
 
 @dataclass(frozen=True)
 class Copy:
@@ -39,17 +43,17 @@ class Copy:
     sizes: ModelSizes  # of the scene's own mesh
     text: str  # whose modes and sag are told, and how exact the sizes are, in sentences
     finer: float  # edges of the cells of the scene over those of the copy, the largest ratio [1]
+    boundary: int  # nodes of the scene's own mesh on its boundary
     counted: bool = False  # whether the unknowns are counted; else computed
     alike: bool = True  # whether singular ends and error of the mesh follow from it
+    ends: Ends | None = None  # singular ends of the scene's own body, around which its cells were counted on a sample
+    notes: tuple[str, ...] = ()  # warnings, one sentence each
 
 
 def build_seconds(scene: Scene) -> float:
-    """Modelled time to build a box [s]; 0 for other scenes.
-
-    Scenes are others too where a tolerance chooses the cells, and where a plan asks for the nodes of the mesh itself.
-    """
+    """Modelled time to build a box [s]; 0 for other scenes, and where a tolerance chooses the cells."""
     tissue, refine = scene.tissue, scene.tissue.refine
-    if not tissue.cells or scene._given is not None or planned(scene):
+    if not tissue.cells or scene._given is not None:
         return 0.0
     d = len(tissue.cells)
     if d * _lattice(scene) <= MOST_LOOKED_AT[d]:  # its copy would be itself
@@ -57,11 +61,6 @@ def build_seconds(scene: Scene) -> float:
     if refine is not None and not (by_lines(scene) and refine.tolerance is None and d * _lattice(scene) <= refine.most):
         return 0.0
     return BUILD[d, tissue.order] * box_simplices(tissue.cells)
-
-
-def planned(scene: Scene) -> bool:
-    """Whether a plan asks for the nodes of the mesh itself."""
-    return scene.control is not None and scene.control.constraints is not None
 
 
 def box_copy(scene: Scene, comm: MPI.Intracomm) -> Copy | None:
@@ -76,7 +75,10 @@ def box_copy(scene: Scene, comm: MPI.Intracomm) -> Copy | None:
         f"{NOT_ASSEMBLED}the same scene on coarser cells, n_e = {model.system.layout.n_e}. Sizes with about are "
         "computed from that copy, to 1 % of the unknowns and 10 % of the non-zeros."
     )
-    return Copy(model, sizes_from(model, scene), text, max(few / many for few, many in pairs))
+    finer = max(few / many for few, many in pairs)
+    order = scene.tissue.order
+    boundary = _lattice(scene) - math.prod(order * n - 1 for n in cells)
+    return Copy(model, sizes_from(model, scene), text, finer, boundary)
 
 
 def cubic_copy(
@@ -87,7 +89,7 @@ def cubic_copy(
     None where there are too many or few; and the mesh, if it was made or is given. Collective.
     """
     adaptive = scene.tissue.refine is not None and scene.tissue.refine.tolerance is not None
-    if scene.tissue.order < 3 or planned(scene) or not (adaptive or scene.tissue.mesh):
+    if scene.tissue.order < 3 or not (adaptive or scene.tissue.mesh):
         return None, mesh
     mesh = mesh or refined_mesh(comm, scene)
     check_dimension(scene, d := mesh.dimension)
@@ -103,7 +105,28 @@ def cubic_copy(
         f"{LOOKED_AT}the same cells with quadratic elements, tissue.order = 2, "
         f"n_e = {model.system.layout.n_e}; the number of non-zeros is computed from that copy."
     )
-    return Copy(model, sizes, text, 1.0, counted=True), mesh
+    on = comm.allreduce(sum(int(np.count_nonzero(flags)) for flags in model.space.surface()))
+    boundary = boundary_nodes(d, on // 2 if d == 2 else (on + 6) // 4, 3)  # of quadratic elements 2 V, or 4 V - 6
+    return Copy(model, sizes, text, 1.0, boundary, counted=True), mesh
+
+
+def boundary_nodes(d: int, vertices: int, order: int) -> int:
+    """Nodes on the boundary of a body without holes that has so many vertices there, by Euler's formula."""
+    if d == 2:
+        return order * vertices
+    edges, facets = 3 * (vertices - 2), 2 * (vertices - 2)
+    return vertices + (order - 1) * edges + math.comb(order - 1, 2) * facets
+
+
+def too_many(scene: Scene, n_e: int) -> tuple[str, ...]:
+    """The warning that a graded mesh of about so many unknowns may be refused; empty where it fits."""
+    refine = scene.tissue.refine
+    if refine is None or refine.tolerance is not None or n_e <= refine.most:
+        return ()
+    return (
+        f"The graded mesh has about {n_e} unknowns, and tissue.refine.most = {refine.most} allows fewer: simulate "
+        "refuses a mesh that has more; raise it, or use larger cells.",
+    )
 
 
 def node_pairs_of(counts: Sequence[int], order: int) -> tuple[int, int]:

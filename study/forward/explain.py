@@ -138,6 +138,7 @@ class Explanation:
     coarser: int  # unknowns of the smaller copy of a large mesh that gives modes, sag and estimate [1]; 0: none
     built: bool  # whether the mesh itself was assembled; else the entries are computed from the copy
     counted: bool  # whether the unknowns are counted; else computed from the copy
+    sampled: bool  # whether its cells are counted on a sample of those that are bisected
     copied: str  # whose modes and sag these are, where they are a copy's, in sentences
     dimension: int  # 2 or 3
     plan: PlanSizes | None = None  # of the plan past obstacles that `control` makes; None where it makes none
@@ -219,6 +220,7 @@ def _explained(
             *_warnings(scene, poisson, omega, dt, d, reports, problem.sag),
             *small_obstacles(known, 1.0 if copy is None else copy.finer, scene.tissue.order),
             *away,
+            *(() if copy is None else copy.notes),
         ),
         outputs=output_places(known),
         memory=need(scene, d, sizes.cells, ranks, run=True),
@@ -229,9 +231,10 @@ def _explained(
         coarser=0 if looked is model else small.layout.n_e,
         built=model is not None,
         counted=copy is None or copy.counted,
+        sampled=copy is not None and copy.ends is not None,
         copied=copied,
         dimension=d,
-        plan=None if model is None else _plan(model),
+        plan=_plan(known, None if copy is None else copy.boundary),
     )
 
 
@@ -241,13 +244,13 @@ def _snapshot_columns(scene: Scene, n_e: int) -> int:
     return len(spread(columns, looked_at(n_e))) if scene.output.snapshots == "auto" else columns
 
 
-def _plan(model: Model) -> PlanSizes | None:
-    """Sizes of the quadratic program of `control`. Collective."""
+def _plan(model: Model, boundary: int | None) -> PlanSizes | None:
+    """Sizes of the quadratic program of `control`, for a mesh with so many nodes on its boundary. Collective."""
     if model.scene.control is None or model.scene.control.constraints is None:
         return None
     from softgrasp.lqr.design.constrained import plan_sizes  # no other scene needs it
 
-    return plan_sizes(model)
+    return plan_sizes(model, boundary)
 
 
 def mesh_report(
@@ -257,7 +260,9 @@ def mesh_report(
     known = model or looked
     tissue, order, refine = known.space.mesh, scene.tissue.order, scene.tissue.refine
     small = tissue.mesh.topology.index_map(tissue.dimension).size_global <= LARGE and (copy is None or copy.alike)
-    ends = scene_ends(known.system.layout.comm, tissue, known.scene) if small else None
+    ends = None if copy is None else copy.ends
+    if ends is None and small:
+        ends = scene_ends(known.system.layout.comm, tissue, known.scene)
     pairs = () if ends is None else zip(ends.kind, ends.alpha, strict=True)
     counts = Counter((kind, round(float(alpha), 3)) for kind, alpha in pairs)
     kinds = tuple(EndReport(k, n, a) for (k, a), n in sorted(counts.items(), key=lambda item: item[0][1]))

@@ -45,10 +45,11 @@ def sections(result: Explanation) -> list[Section]:
     """The parts of the page."""
     s, t, solver = result.sizes, result.time, result.solver
     about, near = "" if result.counted else "about ", "" if result.built else "about "
+    cells, nodes = (f"about {int(float(f'{n:.1e}'))}" if result.sampled else f"{n}" for n in (s.cells, s.nodes))
     states = s.states if result.counted else int(float(f"{s.states:.2e}"))
     sizes = [
         ("hand, tissue unknowns, states", f"n_s = {s.n_s}, n_e = {about}{s.n_e}, 2n = {about}{states}"),
-        ("cells, nodes, non-zeros of K_ee", f"{s.cells}, {s.nodes}, {near}{s.nonzeros}"),
+        ("cells, nodes, non-zeros of K_ee", f"{cells}, {nodes}, {near}{s.nonzeros}"),
         *((f"output {name}", place) for name, place in result.outputs.items()),
         ("Poisson's ratio", ", ".join(f"{nu:.4g} ({name})" for name, nu in result.poisson.items())),
         ("solver", f"{solver.name}: {solver.reason}"),
@@ -59,7 +60,7 @@ def sections(result: Explanation) -> list[Section]:
         ("time", f"{t.steps} steps of {t.dt:.4g} s to {t.end:.4g} s"),
     ]
     if (plan := result.plan) is not None:
-        program = f"{plan.variables} variables, {plan.rows} rows, {plan.intervals} intervals of {plan.grid:g} s"
+        program = f"{plan.variables} variables, {about}{plan.rows} rows, {plan.intervals} intervals of {plan.grid:g} s"
         sizes.append(("plan of control, longer where its end is not safe", f"N = {plan.N}, {program}"))
     effects = [
         (f"{name}: {verdict(e)}", ". ".join(filter(None, (e.gate.comparison, e.gate.sentence))))
@@ -109,8 +110,9 @@ def summary(result: Explanation) -> list[str]:
     """What it is, in three sentences."""
     on = [name for name, e in result.effects.items() if e.on]
     sag, s, about = result.sag, result.sizes, "" if result.counted else "about "
+    cells = f"about {int(float(f'{s.cells:.1e}'))}" if result.sampled else f"{s.cells}"
     return [
-        f"The tissue has n_e = {about}{s.n_e} unknowns in {s.cells} cells; {result.solver.name} solves its "
+        f"The tissue has n_e = {about}{s.n_e} unknowns in {cells} cells; {result.solver.name} solves its "
         f"{result.time.steps} steps of {result.time.dt:.3g} s.",
         f"Effects that are on: {in_words(on)}; on although they do not matter: {in_words(result.idle)}; "
         f"off although they would matter: {in_words(result.missing)}.",

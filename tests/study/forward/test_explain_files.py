@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
 import pytest
 from mpi4py import MPI
 
+from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.model.refined import refined_mesh
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.scene.tissue import Refine
 from softgrasp.study.forward import copies, filed
+from softgrasp.study.forward import explain as forward_explain
 from softgrasp.study.forward.copies import node_pairs_of
 from softgrasp.study.forward.explain import explain
 from softgrasp.study.forward.explain_page import sections
@@ -111,6 +117,102 @@ def test_a_body_is_mended_before_it_is_copied(
     said = [text for text in copied.warnings if "tissue.repair joined them" in text]
     assert said == [text for text in own.warnings if "tissue.repair joined them" in text]
     assert said
+
+
+def never_assembled(monkeypatch: pytest.MonkeyPatch, counts: list[int]) -> None:
+    """Models of as many cells as a bar of these counts has, or more, raise."""
+    cells = math.prod(counts) * math.factorial(len(counts))
+
+    def built(*args: Any, **keys: Any) -> Model:
+        model = build(*args, **keys)
+        assert model.cells < cells
+        return model
+
+    for module in (copies, filed, forward_explain):
+        monkeypatch.setattr(module, "build", built)
+
+
+@pytest.mark.parametrize(
+    ("counts", "order", "refine", "off"),
+    [
+        ([20, 60], 2, {}, 0.05),
+        ([20, 60], 1, {"tolerance": 2e-3}, 0.05),
+        ([20, 60], 1, {"tolerance": 1e-4, "most": 20_000}, 0.2),  # the tolerance grows by quarters until that fits
+        ([6, 6, 16], 1, {}, 0.2),
+        ([5, 5, 14], 1, {"tolerance": 5e-3}, 0.2),
+    ],
+)
+def test_cells_that_follow_the_ends_of_a_file_are_counted_on_a_sample(
+    comm: MPI.Intracomm,
+    mpi_tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    counts: list[int],
+    order: int,
+    refine: dict[str, float],
+    off: float,
+) -> None:
+    """Sizes, ends and modes against those of the bisected mesh. ``off`` is what the page says."""
+    scene = bar(comm, mpi_tmp_path, counts, order)
+    refined = Refine.model_validate(refine)
+    scene = scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"refine": refined})})
+    monkeypatch.setattr(filed, "LARGE", {2: math.inf, 3: math.inf})
+    own = explain(scene, comm)
+    assert (own.coarser, own.sampled) == (0, False)
+    monkeypatch.setattr(filed, "LARGE", {2: 1000, 3: 1000})
+    never_assembled(monkeypatch, counts)
+    copied = explain(scene, comm)
+    assert (copied.built, copied.sampled) == (False, True)
+    for size in ("n_e", "cells", "nodes"):
+        assert getattr(copied.sizes, size) == pytest.approx(getattr(own.sizes, size), rel=off)
+    assert copied.memory.mesh == pytest.approx(own.memory.mesh, rel=off)
+    kinds = [(end.kind, end.alpha) for end in own.mesh.ends]
+    assert [(end.kind, end.alpha) for end in copied.mesh.ends] == kinds
+    near = {2: 0.02, 3: 0.1}[own.dimension]  # measured 0.7 % and, of linear elements that are stiffer, 7 %
+    np.testing.assert_allclose(copied.time.omega[:3], own.time.omega[:3], rtol=near)
+    (said,) = [part.text for part in sections(copied) if part.title == "Mesh"]
+    assert "counted on a sample" in said
+
+
+def test_a_file_with_more_unknowns_than_refinement_allows_is_refused_as_it_is(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the words of simulate; where only the finer mesh has too many, a warning."""
+    scene = bar(comm, mpi_tmp_path, [20, 60])
+    monkeypatch.setattr(filed, "LARGE", {2: 1000})
+
+    def limited(most: int) -> Scene:
+        return scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"refine": Refine(most=most)})})
+
+    said = []
+    for command in (explain, refined_mesh):
+        with pytest.raises(SceneError, match="most = 2000 unknowns are fewer than the 2562") as caught:
+            command(*((limited(2000), comm)[:: 1 if command is explain else -1]))
+        said.append(str(caught.value))
+    assert said[0] == said[1]
+    assert any("tissue.refine.most = 2600 allows fewer" in text for text in explain(limited(2600), comm).warnings)
+    assert not any("allows fewer" in text for text in explain(limited(6000), comm).warnings)
+
+
+@pytest.mark.parametrize("counts", [[24, 72], [6, 6, 18]])
+def test_the_plan_past_obstacles_of_a_large_file_is_that_of_its_own_boundary(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch, counts: list[int]
+) -> None:
+    """Variables and rows, which are counted by boundary nodes, equal those of the assembled mesh."""
+    d = len(counts)
+    keys = bar(comm, mpi_tmp_path, counts).model_dump(by_alias=True, exclude_none=True, exclude_defaults=True)
+    keys["effects"] = {"damping": {"kind": "kelvin-voigt", "beta": 0.002}}
+    keys["obstacle"] = [{"name": "wall", "kind": "halfspace", "normal": [-1.0] + [0.0] * (d - 1), "offset": -1.0}]
+    tip = [0.05] * (d - 1) + [0.3]
+    keys["control"] = {"outputs": [{"kind": "node", "point": tip, "name": "tip"}], "constraints": {"force": 8.0}}
+    scene = Scene.model_validate(keys)
+    own = explain(scene, comm)
+    monkeypatch.setattr(filed, "LARGE", {2: 1000, 3: 1000})
+    never_assembled(monkeypatch, counts)
+    copied = explain(scene, comm)
+    assert (own.built, copied.built) == (True, False)
+    assert copied.plan == own.plan
+    keys["control"]["constraints"]["body"] = ["tip"]
+    assert explain(Scene.model_validate(keys), comm).plan.rows < copied.plan.rows / 10
 
 
 def test_cubic_elements_are_explained_by_quadratic_ones(comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch) -> None:
