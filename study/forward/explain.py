@@ -193,6 +193,7 @@ def _explained(
     }
     columns = _snapshot_columns(scene, sizes.n_e)
     dt = scene.time_end / scene.time.steps
+    periods = tuple((2 * np.pi / omega).tolist())
     poisson = poisson_ratios(small)
     copied = "" if copy is None else copy.text
     if model is not None and looked is not model:
@@ -202,14 +203,7 @@ def _explained(
         equation=equation(scene),
         sizes=sizes,
         solver=SolverPlan(name, reason, factor_bytes(name, sizes.n_e, d, copies)),
-        time=TimePlan(
-            steps=scene.time.steps,
-            dt=dt,
-            end=scene.time_end,
-            omega=problem.omega,
-            periods=tuple((2 * np.pi / omega).tolist()),
-            omega_dt=tuple((omega * dt).tolist()),
-        ),
+        time=TimePlan(scene.time.steps, dt, scene.time_end, problem.omega, periods, tuple((omega * dt).tolist())),
         effects=reports,
         poisson=poisson,
         missing=tuple(key for key, r in reports.items() if not r.on and r.gate.matters),

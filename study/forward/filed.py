@@ -13,7 +13,7 @@ from softgrasp.fem.errors import MeshError, SceneError, raise_on_all_ranks
 from softgrasp.fem.mesh.check import Flags, Floats, outer_facets, sizes_of
 from softgrasp.fem.mesh.singular import Ends
 from softgrasp.fem.mesh.tissue_mesh import MeshArrays, TissueMesh, spread
-from softgrasp.fem.model.build import build
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.contact import BOX_TOLERANCE
 from softgrasp.fem.model.memory import check_memory
 from softgrasp.fem.model.refined import ends_at, sampled_cells, too_large
@@ -113,8 +113,14 @@ def file_copy(scene: Scene, comm: MPI.Intracomm) -> tuple[Copy | None, TissueMes
         with raise_on_all_ranks(comm):
             arrays = None if body is None else checked(body, tissue.repair, tissue.seam)
         return None, spread(comm, arrays)
-    n_e = int(float(f"{outline.unknowns(tissue.order):.2e}"))
-    sizes = computed(model, tissue.order, outline.counts, n_e)
+    return _copy(scene, model, outline), mesh
+
+
+def _copy(scene: Scene, model: Model, outline: Outline) -> Copy:
+    """Of the model of a lattice, with the sizes of the file. Collective."""
+    order, d = scene.tissue.order, len(outline.counts) - 1
+    n_e = int(float(f"{outline.unknowns(order):.2e}"))
+    sizes = computed(model, order, outline.counts, n_e)
     exact = "to 1 % of the unknowns and 10 % of the non-zeros. Singular ends and faults"
     if outline.ends is not None:
         exact = f"{SAMPLED[d]} of the unknowns, as cells are counted on a sample of those of the file. Faults"
@@ -123,9 +129,9 @@ def file_copy(scene: Scene, comm: MPI.Intracomm) -> tuple[Copy | None, TissueMes
         f"elements, n_e = {model.system.layout.n_e}, {outline.differs}. Sizes with about are computed, {exact} of the "
         "file are not looked for."
     )
-    boundary = boundary_nodes(d, outline.skin, tissue.order)
+    boundary = boundary_nodes(d, outline.skin, order)
     notes = too_many(scene, sizes.n_e)
-    return Copy(model, sizes, text, outline.finer, boundary, alike=False, ends=outline.ends, notes=notes), mesh
+    return Copy(model, sizes, text, outline.finer, boundary, alike=False, ends=outline.ends, notes=notes)
 
 
 def _large(body: Body, order: int, cells: float) -> bool:
