@@ -120,6 +120,8 @@ def load_body(path: Path, scale: float, limit: float | None = None) -> Body:
             f"{path} has cells of type {', '.join(kinds) or 'none'}: only triangles, quadrilaterals, tetrahedra, "
             "hexahedra, wedges and pyramids are accepted, export the mesh with these."
         )
+    if None in raw.cell_sets:  # of Abaqus, as "*Elset, elset,=far"
+        raise MeshError(f"{path} has a set of cells without a name: give it one, as in elset=NAME.")
     for block in raw.cells:
         if block.data.size and not 0 <= block.data.min() <= block.data.max() < len(raw.points):
             raise MeshError(f"{path} has cells with node numbers outside 0 to {len(raw.points) - 1}: export it again.")
@@ -278,7 +280,7 @@ def _named(
     """
     holds = {}
     for name, lists in raw.cell_sets.items():
-        if name is None or name.startswith("gmsh:"):  # without a name, or numbers of CAD entities, not of cells
+        if name.startswith("gmsh:"):  # numbers of CAD entities, not of cells
             continue
         if len(lists) != len(raw.cells) or not all(_is_cell_list(part) for part in lists):
             continue

@@ -249,6 +249,7 @@ def test_meshio_reads_without_a_compiler(tmp_path: Path, monkeypatch: pytest.Mon
         *("", "*NODE", ABAQUS.replace("3, 7", "3, 8"), GMSH.replace("9\n5", "9\n"), GMSH + "x"),
         ABAQUS.replace("5, 9, 1", " 5, 9, 99999999999999999999"),
         ABAQUS.replace("5, 9, 1", "5, 9, 0"),
+        ABAQUS.replace("elset=far", "elset,=far"),  # a set without a name
     ],
 )
 def test_wrong_files_end_in_the_sentence_of_meshio(
