@@ -242,7 +242,7 @@ class Coulomb(Rounds):
 
     def _matrices(self) -> None:
         """Let the struct have W^-1 and both matrices in single precision, where they are."""
-        made, self.f.sure = self.inverse.made, self.inverse.sure
+        made, self.f.sure = self.inverse.made, self.inverse.error
         low = (self.inverse.single(False), self.inverse.single(True)) if self.f.single else (NONE, NONE)
         for name, array in (("inverse", made), ("low", low[0]), ("inverse_low", low[1])):
             if len(array):

@@ -151,6 +151,7 @@ static void apply(const Flat *f) {
 static void account(Flat *f, int n) {
   double *force = f->force + (size_t)n * f->obstacles * f->d, *touching = f->touching + (size_t)n * f->obstacles;
   double *hand = f->hand + (size_t)n * f->n_s, energy[4] = {0}; /* of the step, or rounding of the sums would add up */
+  f->rubbed = 0;
   for (int j = 0; j < f->k; j++) {
     const int *row = f->row + 4 * j, o = row[0], i = row[1];
     if (!(f->x[j - row[3]] > 0)) continue;
@@ -162,10 +163,11 @@ static void account(Flat *f, int n) {
       for (int k = 0; k < f->n_s; k++) hand[k] += f->T[(size_t)(i * f->d + a) * f->n_s + k] * x;
       energy[0] += 2 * x * f->moved[i * f->d + a];
     }
+    const double rubbed = row[3] == 0 ? 0 : f->x[j] * 2 * value(f, j);
     if (row[3] == 0) energy[1] += f->x[j] * f->gap[(size_t)o * f->p + i];
-    else energy[3] -= f->x[j] * 2 * value(f, j);
+    energy[3] -= rubbed;
+    if (row[3] != 0 && f->kind[j / (1 + f->m)] == 2) f->rubbed += rubbed;
   }
-  f->rubbed = -energy[3];
   for (int k = 0; k < 4; k++) f->energy[k] += energy[k];
 }
 

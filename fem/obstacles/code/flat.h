@@ -40,7 +40,7 @@ typedef struct {
   const double *columns;    /* S^-1 N' on the rows here, a column after the other (.., n) */
   const double *W;          /* N S^-1 N', with the hand's part where it feels the tissue (k, k) */
   double *free, *x, *b;     /* right-hand side of the small problem, forces, velocities to stop (k) */
-  double rubbed;            /* work of friction in the step */
+  double rubbed;            /* work of friction on slipping nodes in the step: that on others is rounding */
   double *change;           /* what the last forces added to that of each column */
   double entries;           /* that a solve reads: where columns have more, it is taken instead of them */
   const Swept *swept;       /* F N' instead of S^-1 N', or 0 */

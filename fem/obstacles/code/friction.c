@@ -4,7 +4,8 @@
 #include "jolt.h"
 
 static const double NEAR = 0.2, EXACT = 1e-14; /* by how much a round reduces its residual, in 3D and in 2D */
-static const double SURELY = 1e-4; /* of tol: what settling may change unseen */
+static const double SURELY = 1e-4, INEXACT = 0.5; /* of tol: what settling may change unseen, and the error of W^-1 */
+static const double VAGUE = 1e-5, CLEAR = 10; /* error of a product in single precision, and how far above it a round goes on */
 
 /* y = W x + q, or W (x - base) + q. */
 static void evaluate(const Rub *f) {
@@ -69,7 +70,7 @@ static int classify(Rub *f) {
 }
 
 /* y as the sets say, and x with it, where y is unknown; `all`: x from y alone. */
-static void adapt(const Rub *f, int all) {
+static void adapt(Rub *f, int all) {
   const int s = 1 + TANGENTS, K = f->k * s;
   double *u = f->room, *v = u + K;
   int some = all;
@@ -82,7 +83,7 @@ static void adapt(const Rub *f, int all) {
   }
   if (!some) return;
   times(f, 1, u, v, NULL);
-  for (int r = 0; r < K; r++) f->x[r] = (all ? 0 : f->x[r]) + v[r];
+  for (int r = 0; r < K; r++) f->x[r] = (!all ? f->x[r] : f->based ? f->base[r] : 0) + v[r];
 }
 
 /* Whether slips are the unknowns, as W^-1 is there and few enough nodes are open; a change costs a factor. */
@@ -101,6 +102,7 @@ void softgrasp_begin(Rub *f, int where, int known) {
   const int s = 1 + TANGENTS, K = f->k * s;
   const int had = f->had;
   f->begun = 0;
+  f->vague = 0;
   if (where == FIRST) f->had = 0;
   for (int r = 0; where == FIRST && r < K; r++) f->had |= f->x[r] != 0;
   f->led = where == FIRST && had && f->had;
@@ -252,20 +254,32 @@ static int descend(Rub *f) {
 
 static void end_round(Rub *f) {
   const int s = 1 + TANGENTS, K = f->k * s;
-  double *u = f->room, *v = u + K, *known = v + K;
+  double *u = f->room, *known = u + K, *own = f->slips ? f->y : f->x, *other = f->slips ? f->x : f->y, most = 0;
   say(f, known);
   spread(f, f->solved, u);
-  for (int r = 0; r < K; r++) u[r] += known[r];
   f->begun = 0;
-  if (f->slips) {
-    if (f->inverse_low) times(f, 1, u, v, NULL);
-    else v = f->follows;
-    for (int r = 0; r < K; r++) f->y[r] += u[r], f->x[r] += v[r];
-    return;
+  for (int r = 0; r < K; r++) {
+    own[r] += u[r] + known[r], other[r] += f->follows[r];
+    most = fmax(most, fabs(f->follows[r]) * (f->slips ? diagonal(f, r) : 1));
   }
-  for (int r = 0; r < K; r++) f->x[r] += u[r];
+  if (f->slips ? f->inverse_low != 0 : f->low != 0) f->vague += VAGUE * most;
+  if (f->slips) return;
   settle(f);
-  evaluate(f);
+  if (!f->low) evaluate(f);
+}
+
+/* y or x, whichever follows, in double precision. */
+static void clear(Rub *f) {
+  if (f->slips) adapt(f, 1);
+  else evaluate(f);
+  f->vague = 0;
+}
+
+/* The largest number of what forces do. */
+static double largest(const Rub *f) {
+  double most = 0;
+  for (int r = 0; r < f->k * (1 + TANGENTS); r++) most = fmax(most, fabs(f->y[r] - f->q[r]));
+  return most;
 }
 
 /* Rounds from round `begin` on. WANTED: call softgrasp_matrix, factor LU, and call again with the round in tally[2]. */
@@ -276,10 +290,15 @@ int softgrasp_rub(Rub *f, int begin, int rounds) {
       double left = round || f->led ? 0 : residual(f, b);
       int changed = 0;
       if (left <= f->tol) changed = classify(f), left = residual(f, b);
+      if (f->vague && left <= fmax(f->tol, CLEAR * f->vague)) {
+        clear(f);
+        changed |= classify(f);
+        left = residual(f, b);
+      }
       if (!changed && left <= f->tol) {
         if (!f->slips) return SOLVED;
         settle(f);
-        if (f->sure && left <= SURELY * f->tol) return SOLVED;
+        if (left <= SURELY * f->tol && f->sure * largest(f) <= INEXACT * f->tol) return SOLVED;
         evaluate(f);
         changed = classify(f);
         left = residual(f, b);

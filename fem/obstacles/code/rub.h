@@ -41,7 +41,7 @@ typedef struct {
   double *q, *base;          /* y without forces; while `based` is 1, y under the forces `base` */
   int based;
   const double *inverse;     /* of W, (K, K) with K = k (1 + m), or NULL */
-  int sure;                  /* whether it is exact but for rounding */
+  double sure;               /* error of W times it times numbers, over the largest of these */
   const float *low, *inverse_low; /* both in single precision, where steps use it, or NULL */
   double tol;                /* of gaps and slips */
   double *before, *before_y; /* x and y at the end of the step before the last (K) */
@@ -61,9 +61,10 @@ typedef struct {
   double work;               /* and their cost [s] */
   int begun, taken, n;       /* whether a round is in work, its steps and unknowns */
   double left, target;       /* its residual, and where it ends */
+  double vague;              /* what products in single precision may have changed residuals by since the last one in double */
   double *solved, *lacks;    /* unknowns of the round, and residual (K) */
   double *Z, *C, *V;         /* its steps, the matrix times them, and what follows from them (KEPT, K) */
-  double *follows;           /* what follows from the unknowns, where products are in double precision (K) */
+  double *follows;           /* what follows from the unknowns (K) */
   double *room;              /* 8 K numbers */
   double best;               /* least residual of the rounds, but for a factor of 2, */
   int since;                 /* and its round */
@@ -180,10 +181,25 @@ static void eliminate(int n, double *LU, int *pivot) {
   }
 }
 
+/* Row of_v of the node i of W or W^-1 into v, at the nodes between each two that `run` has. */
+static void combine(const Rub *f, int i, const double *of_v, const int *run, int count, double *v) {
+  const int s = 1 + TANGENTS, K = f->k * s, ld = f->slips ? K : f->ld;
+  const double *rows = (f->slips ? f->inverse : f->W) + (size_t)i * s * ld;
+  const float *low = f->slips ? f->inverse_low : f->low;
+  if (low) low += (size_t)i * s * K;
+  for (int g = 0; g < count; g += 2) {
+    for (int j = run[g] * s; low && TANGENTS > 1 && j < run[g + 1] * s; j++)
+      v[j] = of_v[0] * low[j] + of_v[1] * low[K + j] + of_v[2] * low[2 * (size_t)K + j];
+    for (int j = run[g] * s; !low && j < run[g + 1] * s; j++) {
+      v[j] = of_v[0] * rows[j] + of_v[1] * rows[ld + j];
+      if (TANGENTS > 1) v[j] += of_v[2] * rows[2 * (size_t)ld + j];
+    }
+  }
+}
+
 /* The matrix of the present sets by rows, into LU; whether it is factored there. */
 int softgrasp_matrix(Rub *f) {
-  const int s = 1 + TANGENTS, K = f->k * s, ld = f->slips ? K : f->ld;
-  const double *M = f->slips ? f->inverse : f->W;
+  const int s = 1 + TANGENTS, K = f->k * s;
   double *v = f->room, *row = v + K, of_v[3], of_u[3];
   memcpy(f->kind0, f->kind, f->k * sizeof(int));
   memcpy(f->e0, f->e, (size_t)f->k * s * sizeof(double));
@@ -201,13 +217,8 @@ int softgrasp_matrix(Rub *f) {
   if (in) run[count++] = f->k;
   for (int i = 0, r = 0; i < f->k; i++)
     for (int a = 0; a < width(f, f->slips, f->kind[i]); a++, r++) {
-      const double *rows = M + (size_t)i * s * ld;
       row_of(f, f->slips, i, f->kind[i], f->e + i * s, a, of_v, of_u);
-      for (int g = 0; g < count; g += 2)
-        for (int j = run[g] * s; j < run[g + 1] * s; j++) {
-          v[j] = of_v[0] * rows[j] + of_v[1] * rows[ld + j];
-          if (TANGENTS > 1) v[j] += of_v[2] * rows[2 * (size_t)ld + j];
-        }
+      combine(f, i, of_v, run, count, v);
       for (int b = 0; b < s; b++) v[i * s + b] += of_u[b];
       if (!f->slips && (a == 0 || f->kind[i] == STICK)) v[i * s + a] *= 1 + (f->single ? RIDGE_SINGLE : RIDGE);
       double *to = f->single ? row : f->LU + (size_t)r * f->size;

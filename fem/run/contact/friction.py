@@ -70,7 +70,7 @@ def rubbing_impulse(
     Args:
         jolt: problem of the impulses, with room for the rows, and sets to begin from.
         x: forces of the step on the rows [N], (k, d).
-        rubbed: work of friction in the step [J].
+        rubbed: work of friction on slipping nodes in the step [J].
         mu: coefficients of friction, (k,).
         A: N M^-1 N' of the rows, a normal and then its tangents, (k d, k d).
         v: velocities along them, (k, d).
@@ -164,9 +164,9 @@ class FrictionContact(Contact):
         A = np.ascontiguousarray(self.strike.reactions().matrix(node, axes))
         self.jolt.fit(len(rows.node))
         self.jolt.kind[:], self.jolt.e[:] = rows.kind, rows.e
-        x, rubbed = np.column_stack([rows.x, rows.x_t]), float(np.einsum("ka,ka->", rows.x_t, rows.slip))
-        mean = speed.copy()
-        mean[rows.kind == SLIP, 1:] = rows.slip[rows.kind == SLIP] / self.dt
+        x, slips, mean = np.column_stack([rows.x, rows.x_t]), rows.kind == SLIP, speed.copy()
+        rubbed = float(np.einsum("ka,ka->", rows.x_t[slips], rows.slip[slips]))  # of others it is rounding
+        mean[slips, 1:] = rows.slip[slips] / self.dt
         y = rubbing_impulse(self, self.jolt, x, rubbed, self.mu[rows.obstacle], A, speed, mean, still)
         if y is None:
             super()._halt(state, n, rows, normal, v, still)

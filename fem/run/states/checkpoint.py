@@ -27,7 +27,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.shown import counted
 
 FORMAT = 8
-FRICTION = 5  # form of the sets of friction in them
+FRICTION = 6  # form of the sets of friction in them
 CONTACT = 5  # form of what contact carries on
 ITERATIONS = 2  # form of the iterations of steps at finite strain or in a frame
 COMPILED = "compiled contact"
