@@ -8,9 +8,9 @@ from mpi4py import MPI
 
 from softgrasp.fem import Model, ResourceError, free_bytes, size_text
 
-# Largest memory over that of all states [z; v_z]: states, their rows in one frame, three copies in a tall QR, its Q and
-# models. Measured 6.9 to 8.5 with 201 and 601 states of 1.7e4 and 4.2e3 unknowns, of which 0.8 the steps before.
-PEAK = 8.0
+# Largest memory over that of all states [z; v_z], of both processes: states, their rows in one frame, copies in tall
+# QRs, their Q, bases and models. Measured 11.0 to 13.0 with 601 states, slopes between 3.2e3, 6.6e3 and 1.6e4 unknowns.
+PEAK = 13.0
 
 
 def check_states(model: Model, comm: MPI.Intracomm) -> None:

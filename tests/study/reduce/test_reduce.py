@@ -28,7 +28,7 @@ from softgrasp.reduction.replay import FullRun, full_run, replay_linear
 from softgrasp.reduction.system import ModelError
 from softgrasp.study.reduce.linear import measure
 from softgrasp.study.reduce.linear.measure import FURTHER, box_models, headline_turns, measure_box, sweep, untimed
-from softgrasp.study.reduce.linear.memory import check_states
+from softgrasp.study.reduce.linear.memory import PEAK, check_states
 from softgrasp.study.reduce.linear.ranks import dealt, of_each_rank
 from softgrasp.study.reduce.times import measured_run
 from tests.helpers.models import gather_matrix, gather_rows, gather_states, make_scene
@@ -282,10 +282,10 @@ def test_states_that_leave_no_memory_for_bases_are_refused_before_the_run(comm: 
 
     states = 16 * 116 * 121
     assert model.system.layout.n_e == 116
-    check_states(allowed(model, 8.01 * states), comm)
-    check_states(allowed(whole, 8.01 * comm.size * states), comm)
+    check_states(allowed(model, 1.001 * PEAK * states), comm)
+    check_states(allowed(whole, 1.001 * PEAK * comm.size * states), comm)
     for each, size in ((model, 1), (whole, comm.size)):
-        short = 8 * size * states / 2.5
+        short = PEAK * size * states / 2.5
         with pytest.raises(ResourceError, match=r"keeps 121 states of 232 numbers.* set output\.every = 3,"):
             check_states(allowed(each, short), comm)
         check_states(allowed(each, short, every=3), comm)
