@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import ConfigDict, Field, PrivateAttr, model_validator
 
 from softgrasp.fem.scene.control import BASES, Control, ControlOutput, Loop, Reduction, Study
 from softgrasp.fem.scene.frame import check_frame
@@ -176,23 +176,34 @@ class Scene(Shown, Section):
     [15, 30]
     """
 
-    name: Label = Field(min_length=1, description="short name [no unit]")
-    description: str = Field("", description="purpose of the scene [no unit]")
-    tissue: Tissue = Field(description="the soft body [m, Pa, kg/m3]")
-    contact: Contact = Field(description="contact zone of hand and tissue [m]")
-    hand: Hand = Field(default_factory=Hand, description="the rigid hand [kg, kg m2, m]")
-    effects: Effects = Field(default_factory=Effects, description="effects that are switched on [various]")
-    motion: Motion = Field(
-        default_factory=lambda: Motion(profile="hold"), description="motion of the hand, or force on it [m, rad, s]"
-    )
-    obstacle: Dropped[Annotated[list[Obstacle], Field(min_length=1)]] = Field(
-        None, description="rigid obstacles, a table each [m]; none unless given"
-    )
-    time: Time = Field(description="time grid and solver [s]")
-    control: Dropped[Control] = Field(None, description="control problem [various]; off unless given")
-    reduction: Reduction = Field(default_factory=Reduction, description="reduced models to compare [various]")
-    study: Study = Field(default_factory=Study, description="tolerances and settings of studies [various]")
-    output: Output = Field(default_factory=Output, description="results that are kept [no unit]")
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    name: Label = Field(min_length=1)
+    """short name [no unit]"""
+    description: str = Field("")
+    """purpose of the scene [no unit]"""
+    tissue: Tissue
+    """the soft body [m, Pa, kg/m3]"""
+    contact: Contact
+    """contact zone of hand and tissue [m]"""
+    hand: Hand = Field(default_factory=Hand)
+    """the rigid hand [kg, kg m2, m]"""
+    effects: Effects = Field(default_factory=Effects)
+    """effects that are switched on [various]"""
+    motion: Motion = Field(default_factory=lambda: Motion(profile="hold"))
+    """motion of the hand, or force on it [m, rad, s]"""
+    obstacle: Dropped[Annotated[list[Obstacle], Field(min_length=1)]] = Field(None)
+    """rigid obstacles, a table each [m]; none unless given"""
+    time: Time
+    """time grid and solver [s]"""
+    control: Dropped[Control] = Field(None)
+    """control problem [various]; off unless given"""
+    reduction: Reduction = Field(default_factory=Reduction)
+    """reduced models to compare [various]"""
+    study: Study = Field(default_factory=Study)
+    """tolerances and settings of studies [various]"""
+    output: Output = Field(default_factory=Output)
+    """results that are kept [no unit]"""
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
     _mesh_digest: str = PrivateAttr("")  # of the mesh file, once it was read
     _energy: Any = PrivateAttr(None)  # `OwnEnergy`, once its file was run or where it was given, or None
