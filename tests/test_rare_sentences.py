@@ -92,7 +92,7 @@ def raced(folder: Path, patch: pytest.MonkeyPatch) -> None:
 
 def no_memory(*_: Any) -> None:
     """PETSc's error 55, as a factor that does not fit raises it."""
-    cholesky._factored(SimpleNamespace(setUp=raised(PETSc.Error(55))))
+    cholesky.make_factor(SimpleNamespace(setUp=raised(PETSc.Error(55))), False)
 
 
 def sagging(force: float) -> Act:
