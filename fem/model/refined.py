@@ -90,21 +90,26 @@ def refined_mesh(comm: MPI.Intracomm, scene: Scene, tolerance: float | None = No
 
 def _lined(comm: MPI.Intracomm, scene: Scene, refine: Refine, goal: float | None) -> TissueMesh:
     size, p = scene.tissue.size or [], min(scene.tissue.order, 3)
-    d, short = len(size), min(size)
     mu = LINES[p] if refine.grading == "auto" else 1.0 if refine.grading == "off" else refine.grading
-    cells = list(scene.tissue.cells or [])
-    if goal is not None:
-        across = LINES_ACROSS[d][p] * (1e-2 / goal) ** (1 / (2 * p))
-        while True:
-            cells = even_cells(scene, short / across)
-            if lattice(cells, p) <= refine.most:
-                break
-            if across <= 1:
-                raise too_large(refine, lattice(cells, p))
-            across = max(across / 1.1, 1.0)
-    elif lattice(cells, p) > refine.most:
-        raise too_large(refine, lattice(cells, p))
-    return box_of_lines(comm, scene, cells, mu, short / 2)
+    return box_of_lines(comm, scene, lined_cells(scene, refine, goal), mu, min(size) / 2)
+
+
+def lined_cells(scene: Scene, refine: Refine, goal: float | None) -> list[int]:
+    """Numbers of cells along the sides of a box with moved lines, for a tolerance or else those of the scene.
+
+    Raises SceneError: even the fewest have more than ``tissue.refine.most`` unknowns.
+    """
+    size, cells, p = scene.tissue.size or [], list(scene.tissue.cells or []), min(scene.tissue.order, 3)
+    if goal is None:
+        if lattice(cells, p) > refine.most:
+            raise too_large(refine, lattice(cells, p))
+        return cells
+    across = LINES_ACROSS[len(size)][p] * (1e-2 / goal) ** (1 / (2 * p))
+    while lattice(cells := even_cells(scene, min(size) / across), p) > refine.most:
+        if across <= 1:
+            raise too_large(refine, lattice(cells, p))
+        across = max(across / 1.1, 1.0)
+    return cells
 
 
 def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
@@ -128,11 +133,16 @@ def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
 
 def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
     """The mesh to bisect with contact zone and layers marked."""
-    size, cells = scene.tissue.size, scene.tissue.cells
-    if size is not None and aim is not None:
-        across, *_ = aims(refine, scene.tissue.order, len(size), aim)
-        cells = even_cells(scene, min(size) / across)
-    return marked(_even(scene, cells), scene)
+    return marked(_even(scene, _base_cells(scene, refine, aim)), scene)
+
+
+def _base_cells(scene: Scene, refine: Refine, aim: float | None) -> list[int] | None:
+    """Numbers of cells along the sides of a box that is to be bisected."""
+    size = scene.tissue.size
+    if size is None or aim is None:
+        return scene.tissue.cells
+    across, *_ = aims(refine, scene.tissue.order, len(size), aim)
+    return even_cells(scene, min(size) / across)
 
 
 def marked(tissue: TissueMesh, scene: Scene) -> Whole:
@@ -214,6 +224,29 @@ def sampled_cells(scene: Scene, refine: Refine, ends: Ends, base: tuple[Floats, 
         middle = (low + high) // 2
         low, high = (low, middle) if each * count(middle) <= refine.most else (middle, high)
     return count(high)
+
+
+def sampled_box(scene: Scene, refine: Refine) -> tuple[Whole, Ends, float, float | None]:
+    """The mesh from which a box is bisected, its singular ends, about how many cells are left, and for which tolerance.
+
+    On one rank; see :func:`bisected_count`. Raises SceneError: see :func:`refined_mesh`.
+    """
+    order, aim = scene.tissue.order, refine.tolerance
+    while True:
+        count = lattice(_base_cells(scene, refine, aim) or [], order)
+        if count <= refine.most:
+            whole = _base(scene, refine, aim)
+            points, cells, ends = whole.points, whole.simplices, ends_of(whole, scene)
+            many = float(len(cells))
+            if refine.grading != "off":
+                many = bisected_count(points, cells, size_field(scene, refine, aim, ends, _lengths(points, cells)))
+            each = whole.dimension * order**whole.dimension / math.factorial(whole.dimension)  # far from the boundary
+            if aim is None or count + each * (many - len(cells)) <= refine.most:
+                return whole, ends, many, aim
+        elif aim is None or aim > 1:
+            raise too_large(refine, count)
+        assert aim is not None  # a mesh without a tolerance was returned or refused
+        aim *= SHRINK
 
 
 def unknowns(whole: Whole, order: int) -> int:

@@ -21,7 +21,7 @@ from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.assembly import discretise
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.memory import box_simplices, check_memory
-from softgrasp.fem.model.refined import by_lines, refined_mesh
+from softgrasp.fem.model.refined import by_lines, lined_cells, refined_mesh
 from softgrasp.fem.scene.scene import check_dimension
 from softgrasp.fem.solve.costs import BUILD
 from softgrasp.study.forward.result import ModelSizes, model_sizes
@@ -51,20 +51,34 @@ class Copy:
 
 
 def build_seconds(scene: Scene) -> float:
-    """Modelled time to build a box [s]; 0 for other scenes, and where a tolerance chooses the cells."""
-    tissue, refine = scene.tissue, scene.tissue.refine
-    if not tissue.cells or scene._given is not None:
+    """Modelled time to build a box [s]; 0 for other scenes, and where cells are bisected."""
+    if not scene.tissue.cells or scene._given is not None:
         return 0.0
-    d = len(tissue.cells)
+    scene = lined(scene)
+    tissue, refine = scene.tissue, scene.tissue.refine
+    d = len(tissue.cells or [])
     if d * _lattice(scene) <= MOST_LOOKED_AT[d]:  # its copy would be itself
         return 0.0
     if refine is not None and not (by_lines(scene) and refine.tolerance is None and d * _lattice(scene) <= refine.most):
         return 0.0
-    return BUILD[d, tissue.order] * box_simplices(tissue.cells)
+    return BUILD[d, tissue.order] * box_simplices(tissue.cells or [])
+
+
+def lined(scene: Scene) -> Scene:
+    """The scene with the cells that a tolerance chooses, where it moves the lines of a box; else the scene itself."""
+    refine = scene.tissue.refine
+    if refine is None or refine.tolerance is None or not by_lines(scene):
+        return scene
+    changes = {
+        "cells": lined_cells(scene, refine, refine.tolerance),
+        "refine": refine.model_copy(update={"tolerance": None}),
+    }
+    return scene.model_copy(update={"tissue": scene.tissue.model_copy(update=changes)})
 
 
 def box_copy(scene: Scene, comm: MPI.Intracomm) -> Copy | None:
     """Of a box, whose sizes are computed; None where fewer cells miss the zone or a layer. Collective."""
+    scene = lined(scene)
     cells = scene.tissue.cells or []
     check_memory(scene, comm, False, len(cells), box_simplices(cells))
     model = on_fewer_cells(scene, comm)
@@ -207,10 +221,10 @@ def fewer_cells(model: Model, most: dict[int, int]) -> Scene | None:
     adaptive = tissue.refine is not None and tissue.refine.tolerance is not None
     if tissue.cells is None or adaptive or layout.n_e <= most[layout.dimension]:
         return None
-    return _coarsened(model.scene, most)
+    return coarsened(model.scene, most)
 
 
-def _coarsened(scene: Scene, most: dict[int, int]) -> Scene:
+def coarsened(scene: Scene, most: dict[int, int]) -> Scene:
     """The scene of a box on the cells of about so many unknowns, by dimension."""
     cells = scene.tissue.cells or []
     ratio = (most[len(cells)] / (len(cells) * _lattice(scene))) ** (1 / len(cells))
@@ -221,6 +235,6 @@ def _coarsened(scene: Scene, most: dict[int, int]) -> Scene:
 def on_fewer_cells(scene: Scene, comm: MPI.Intracomm) -> Model | None:
     """The scene of a box on fewer cells; None where these miss the zone or a layer. Collective."""
     try:
-        return build(_coarsened(scene, MOST_LOOKED_AT), comm=comm, run=False)
+        return build(coarsened(scene, MOST_LOOKED_AT), comm=comm, run=False)
     except (MeshError, SceneError):
         return None

@@ -34,6 +34,7 @@ from softgrasp.fem.model.scales import measure
 from softgrasp.fem.run.forecast import Forecast, forecasts
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT
 from softgrasp.study.forward.accuracy import estimate_error
+from softgrasp.study.forward.bisected import bisected_copy
 from softgrasp.study.forward.cautions import (
     coarse,
     locking,
@@ -155,6 +156,7 @@ def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
         copy, mesh = box_copy(scene, comm), None
     else:
         copy, mesh = file_copy(scene, comm)
+        copy = copy or bisected_copy(scene, comm)
         if copy is None:
             copy, mesh = cubic_copy(scene, comm, mesh)
     if copy is not None:

@@ -90,7 +90,7 @@ def file_copy(scene: Scene, comm: MPI.Intracomm) -> tuple[Copy | None, TissueMes
     with raise_on_all_ranks(comm):
         if comm.rank == 0:
             body = load_body(scene.directory / str(tissue.mesh), tissue.scale, tissue.read_limit)
-            if tissue.refine is not None or _large(body, tissue.order, len(body.cells)):
+            if tissue.refine is not None or large(body.points.shape[1], tissue.order, len(body.cells)):
                 body = mended(body, tissue.seam) if tissue.repair else body
                 arrays, outline = _lattice(scene, body)
             if tissue.refine is None:
@@ -134,9 +134,8 @@ def _copy(scene: Scene, model: Model, outline: Outline) -> Copy:
     return Copy(model, sizes, text, outline.finer, boundary, alike=False, ends=outline.ends, notes=notes)
 
 
-def _large(body: Body, order: int, cells: float) -> bool:
+def large(d: int, order: int, cells: float) -> bool:
     """Whether so many cells have so many unknowns, and could not be looked at with quadratic in place of cubic ones."""
-    d = body.points.shape[1]
     linear = d * cells / math.factorial(d)  # in large regular meshes
     return order**d * linear > LARGE[d] and not (order == 3 and 2**d * linear <= MOST_LOOKED_AT[d])
 
@@ -179,7 +178,7 @@ def _lattice(scene: Scene, body: Body) -> tuple[MeshArrays, Outline] | tuple[Non
     if ends is None:
         return None, None
     many = sampled_cells(scene, refine, ends, (body.points, body.cells), base / cells)
-    return (copy.arrays, outline.grown(many, ends)) if _large(body, order, many) else (None, None)
+    return (copy.arrays, outline.grown(many, ends)) if large(d, order, many) else (None, None)
 
 
 def _ends(scene: Scene, body: Body, low: Floats, high: Floats) -> Ends | None:

@@ -343,7 +343,7 @@ def test_a_box_too_large_to_build_is_explained_by_computed_sizes(
 
 
 def test_scenes_that_need_their_own_mesh_are_built() -> None:
-    """Cells that a tolerance chooses, and more unknowns than are allowed."""
+    """Cells that are bisected, and more unknowns than are allowed."""
     cells = "tissue.cells=[400,800]"
     lines = "tissue.refine={most=700000}"
     assert build_seconds(load_scene("paper_forward", [cells])) == pytest.approx(2.2, abs=0.1)  # 3.5e-6 s a triangle

@@ -18,7 +18,7 @@ from softgrasp.fem.model.refined import refined_mesh
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.tissue import Refine
-from softgrasp.study.forward import copies, filed
+from softgrasp.study.forward import bisected, copies, filed
 from softgrasp.study.forward import explain as forward_explain
 from softgrasp.study.forward.copies import node_pairs_of
 from softgrasp.study.forward.explain import explain
@@ -119,16 +119,15 @@ def test_a_body_is_mended_before_it_is_copied(
     assert said
 
 
-def never_assembled(monkeypatch: pytest.MonkeyPatch, counts: list[int]) -> None:
-    """Models of as many cells as a bar of these counts has, or more, raise."""
-    cells = math.prod(counts) * math.factorial(len(counts))
+def never_assembled(monkeypatch: pytest.MonkeyPatch, cells: int) -> None:
+    """Models of so many cells or more raise."""
 
     def built(*args: Any, **keys: Any) -> Model:
         model = build(*args, **keys)
         assert model.cells < cells
         return model
 
-    for module in (copies, filed, forward_explain):
+    for module in (bisected, copies, filed, forward_explain):
         monkeypatch.setattr(module, "build", built)
 
 
@@ -159,7 +158,7 @@ def test_cells_that_follow_the_ends_of_a_file_are_counted_on_a_sample(
     own = explain(scene, comm)
     assert (own.coarser, own.sampled) == (0, False)
     monkeypatch.setattr(filed, "LARGE", {2: 1000, 3: 1000})
-    never_assembled(monkeypatch, counts)
+    never_assembled(monkeypatch, math.prod(counts) * math.factorial(len(counts)))
     copied = explain(scene, comm)
     assert (copied.built, copied.sampled) == (False, True)
     for size in ("n_e", "cells", "nodes"):
@@ -207,7 +206,7 @@ def test_the_plan_past_obstacles_of_a_large_file_is_that_of_its_own_boundary(
     scene = Scene.model_validate(keys)
     own = explain(scene, comm)
     monkeypatch.setattr(filed, "LARGE", {2: 1000, 3: 1000})
-    never_assembled(monkeypatch, counts)
+    never_assembled(monkeypatch, math.prod(counts) * math.factorial(len(counts)))
     copied = explain(scene, comm)
     assert (own.built, copied.built) == (True, False)
     assert copied.plan == own.plan
