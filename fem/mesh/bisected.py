@@ -49,7 +49,9 @@ def bisected_count(points: Floats, cells: Integers, size: SizeField) -> float:
             kept = random.choice(len(x), FOLLOWED * SAMPLED[d], replace=False)
             weights = weights[kept] * (weights.sum() / weights[kept].sum())
             x, owner = x[kept], owner[kept]
-    return before + MORE[d] * (count - before)
+    else:
+        count += weights.sum()
+    return float(before + MORE[d] * (count - before))
 
 
 def _at_ends(points: Floats, cells: Integers, ends: Ends) -> Integers:

@@ -7,8 +7,7 @@ With w = z_mid - z_n, s = 2/dt, pi = M v and the force f_alg of `softgrasp.fem.s
 
 the linear step with one more load, -(f_alg - K z_mid). The energy W + v'pi/2 changes by the work 2 c'G'w of the load,
 less what D dissipates, and by 2 w'R; so a step ends with fractions of a correction that make w'R = 0 to rounding.
-A step that does not converge is divided into 2, 4, .. 16 substeps under the same load, that of the whole step where
-hand or controller respond to the tissue.
+A step that does not converge is divided into 2, 4, .. 16 substeps under the load that the whole step has.
 """
 
 from __future__ import annotations
@@ -204,17 +203,18 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     def _find(self, guess: Array, balanced: bool = True) -> Root:
         """The root, moved to w'R = 0 if it is to be ``balanced``. Collective."""
-        scale, cancel = self.substeps * self.counts.scale, self.newton.pairs.cancel
-        target = max(self.tol * scale, 4 * self.body.rounding)
+        scale, least, cancel = self.substeps * self.counts.scale, 4 * self.body.rounding, self.newton.pairs.cancel
+        target = max(self.tol * scale, least)
         root = self.newton.find(guess, target)
         if balanced and root.iterations >= 0:
-            moved = cancel(root.x, root.R)
-            if moved is None:  # R does work: iterate on
-                finer = self.newton.find(root.x, max(target / 30, 4 * self.body.rounding))
-                root = root if finer.iterations < 0 else finer._replace(iterations=root.iterations + finer.iterations)
-                moved = cancel(root.x, root.R)
+            while (moved := cancel(root.x, root.R)) is None and target > least:  # R does work: iterate on
+                target = max(target / 30, least)
+                finer = self.newton.find(root.x, target)
+                if finer.iterations < 0:
+                    break
+                root = finer._replace(iterations=root.iterations + finer.iterations)
             for _ in range(MOST_BALANCED):
-                if moved is None or root.norm <= BENDS * scale:
+                if moved is None or root.norm <= max(BENDS * scale, least):
                     break
                 R, norm = self._residual(moved)
                 if not math.isfinite(norm):

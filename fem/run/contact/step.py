@@ -79,7 +79,8 @@ def _refuse_within(model: Model, contact: Contact, q: Array) -> None:
     for (o, _), inside in zip(middles, within, strict=True):
         if inside and o.gap(boundary).min() > 0:
             raise SceneError(
-                f"obstacle '{o.name}' lies within the tissue at the start, out of reach of its boundary; move it"
+                f"obstacle '{o.name}' has its middle within the tissue at the start, and no point of the boundary in "
+                "it; move it"
             )
 
 

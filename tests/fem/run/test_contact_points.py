@@ -155,5 +155,5 @@ def test_ranks_agree(comm: MPI.Intracomm) -> None:
     "within", ["kind='disc', center=[0.5, 1], radius=0.3", "kind='box', lo=[0.2, 1.6], hi=[0.3, 1.7]"]
 )
 def test_an_obstacle_that_no_point_can_touch_is_refused(within: str) -> None:
-    with pytest.raises(SceneError, match=r"obstacle '(disc|box)1' lies within the tissue at the start"):
+    with pytest.raises(SceneError, match=r"obstacle '(disc|box)1' has its middle within the tissue at the start"):
         run(f"obstacle=[{{{within}}}]")
