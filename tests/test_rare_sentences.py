@@ -95,9 +95,9 @@ def no_memory(*_: Any) -> None:
     cholesky.make_factor(SimpleNamespace(setUp=raised(PETSc.Error(55))), False)
 
 
-def sagging(force: float) -> Act:
-    """Newton's method on a body whose force at any place is the same."""
-    potential = SimpleNamespace(force=lambda _: np.array([force]), tangent=lambda _: np.eye(1))
+def sagging(force: float, slope: float = 0.0, tangent: float = 1.0) -> Act:
+    """Newton's method on a body whose force is ``force`` + ``slope`` times its place."""
+    potential = SimpleNamespace(force=lambda a: force + slope * a, tangent=lambda _: np.array([[tangent]]))
     own: Any = SimpleNamespace(
         problem=SimpleNamespace(potential=potential), model=SimpleNamespace(G=np.eye(1)), fall=lambda _: np.ones(1)
     )
@@ -222,6 +222,7 @@ SENTENCES: list[tuple[Act, str]] = [
     (no_memory, "cholesky: PETSc gave up the factorisation of the tissue matrix with error 55 (55 is out of memory); "),
     (sagging(np.inf), "the reduced body folds on the way to its equilibrium under gravity"),
     (sagging(9.0), "Newton's method found no equilibrium of the reduced body under gravity"),
+    (sagging(0.0, -1.0, -1.0), "the equilibrium of the reduced body under gravity is unstable: it buckles"),
     (no_room, "the reduced run does not fit into memory"),
     (never_safe, "the plan is not safe with the coarser bounds of a program online: a node comes too near"),
     (unstable(0.5), "no observer of 10 states leaves the full plant stable, the last one has the abscissa 0.5/s; "),

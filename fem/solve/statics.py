@@ -12,6 +12,8 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, from_options
 from softgrasp.fem.scene.scene import Time
+from softgrasp.fem.solve.cholesky import is_factor
+from softgrasp.fem.solve.entries import definite
 from softgrasp.fem.solve.solvers import ITERATIVE, SolverName, TissueSolver, choose_solver, make_solver
 from softgrasp.fem.solve.stiffness import factored_stiffness
 from softgrasp.fem.system import BlockSystem
@@ -113,11 +115,11 @@ TOL = 1e-11  # |f - t G g| over |G g|
 
 
 def finite_equilibrium(system: BlockSystem, solver: SolverName | None = None) -> Array:
-    """Z with f(z) = G g, stable under small motions of the load; local rows (n_local,) [m]. Collective.
+    """Z with f(z) = G g and a tangent f'(z) > 0; local rows (n_local,) [m]. Collective.
 
     The load t G g grows from 0 to 1 by steps that are halved where Newton's method fails and doubled where it does not.
     Raises SolverError: no step of the load converges; the message names its share t, the cell with the smallest J, and
-    J.
+    J. Or the tangent at the end is not positive definite: the equilibrium is unstable.
     """
     from softgrasp.fem.strain.body import HyperelasticBody  # only scenes with finite strain pay for it
 
@@ -139,15 +141,34 @@ def finite_equilibrium(system: BlockSystem, solver: SolverName | None = None) ->
         step = (aim - t) / 2
         if step < SMALLEST:
             J, place = body.lowest(1 + body.start(z).j, comm)
+            kind = "stable equilibrium" if name in ITERATIVE else "equilibrium"  # cg ends on an indefinite tangent
             raise SolverError(
-                f"finite strain ({body.law.name}): no equilibrium beyond {t:.3g} of the weight; in the cell at {place} "
+                f"finite strain ({body.law.name}): no {kind} beyond {t:.3g} of the weight; in the cell at {place} "
                 f"det F = {J:.3g}: use a stiffer material, or time.start = 'rest'"
             )
     body.refuse(body.start(z), comm)
+    if name not in ITERATIVE and not _stable(body, system, name, z):
+        raise SolverError(
+            f"finite strain ({body.law.name}): the equilibrium under gravity is unstable (its tangent is not positive "
+            "definite), as that of a column that buckles: use a stiffer material or a stouter tissue, or time.start = "
+            "'rest'"
+        )
     for item in (z, f, load):
         item.destroy()
     body.destroy()
     return answer
+
+
+def _stable(body: HyperelasticBody, system: BlockSystem, name: SolverName, z: PETSc.Vec) -> bool:
+    """Whether the tangent at z is positive definite, that is, W(z) - z'G g has a minimum there. Collective.
+
+    ``name``: of a factor; by the signs of its pivots.
+    """
+    solver = make_solver(body.tangent(z).copy(), name, system.layout, "softgrasp_static_", tangent=True)
+    pc = solver.ksp.getPC()
+    stable = not is_factor(pc) or definite(pc.getFactorMatrix())
+    solver.destroy()
+    return stable
 
 
 def _newton(

@@ -163,7 +163,7 @@ class ReducedStrainSystem(Shown):
 
         ``q``: place of the hand (n_s,), which counts where gravity turns with it; None is zero.
 
-        Raises ModelError: there is none within reach.
+        Raises ModelError: there is none within reach, or it is unstable.
         """
         potential, full = self.problem.potential, self.model.G @ self.fall(q)
         a = np.zeros(len(full))
@@ -178,6 +178,8 @@ class ReducedStrainSystem(Shown):
                 a = a + np.linalg.solve(potential.tangent(a), rest)
             else:
                 raise ModelError("Newton's method found no equilibrium of the reduced body under gravity")
+        if full.any() and not np.linalg.eigvalsh(potential.tangent(a))[0] > 0:
+            raise ModelError("the equilibrium of the reduced body under gravity is unstable: it buckles")
         return a
 
     def fall(self, q: Array | None) -> Array:

@@ -20,6 +20,7 @@ from softgrasp.fem.petsc import total
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.states.checkpoint import FORMAT
 from softgrasp.fem.run.states.trajectory import Trajectory
+from softgrasp.fem.solve.solvers import SolverName
 from softgrasp.fem.solve.statics import equilibrium
 from tests.helpers.models import (
     CUBE,
@@ -36,6 +37,7 @@ from tests.helpers.models import (
 LAWS = ("neo-hooke", "neo-hooke-quadratic", "stvk")
 GENTLE = {"motion": {"target": [1.0, 0.6]}}
 VISCOUS = {"damping": {"kind": "rayleigh", "alpha": 0.4, "beta": 0.01}}
+UNSTABLE = "the equilibrium under gravity is unstable"
 STRIP: dict[str, Any] = {
     "tissue": {"size": [0.3, 2.0], "cells": [2, 10]},
     "contact": {"sides": ["top"], "box": [[0.0, 0.0], [0.3, 2.0]]},
@@ -269,6 +271,32 @@ def test_equilibrium_is_scikit_fem_s(g: float) -> None:
         u[free] -= skfem.solve(K[free][:, free], r[free])
     assert close(ours, u[free[order]]) < 1e-8
     assert (np.abs(ours).max() > 2.0) == (g == -150.0)
+
+
+@pytest.mark.ranks(solver=("cholesky", "mumps"))
+@pytest.mark.parametrize(
+    ("solver", "words"), [("cholesky", UNSTABLE), ("mumps", UNSTABLE), ("cg", r"no stable equilibrium beyond 0\.98")]
+)
+def test_a_column_beyond_its_load_is_refused(solver: SolverName, words: str) -> None:
+    """A slender column under its own weight buckles at 7.8373 EI / L^3 [Greenhill 1881], plane strain, to 1 %.
+
+    Beyond, Newton's method still finds it upright: an equilibrium that no column keeps.
+    """
+    column: dict[str, Any] = {
+        "tissue": {"size": [0.1, 2.0], "cells": [2, 20], "order": 2},
+        "contact": {"sides": ["bottom"], "box": [[0.0, 0.0], [0.1, 2.0]]},
+    }
+    m = make_scene(column).tissue.material
+    E = 4 * m.mu * (m.lam + m.mu) / (m.lam + 2 * m.mu)
+    g = 7.8373 * E * 0.1**2 / 12 / (m.rho * 2.0**3)  # EI over the mass of a unit of length, times L^-3
+
+    def stand(part: float) -> None:
+        gravity = {"effects": {"gravity": {"g": [0.0, -part * g]}}, "time": {"start": "equilibrium"}}
+        equilibrium(finite(column, gravity).system, solver)
+
+    stand(0.98)
+    with pytest.raises(SolverError, match=words):
+        stand(1.02)
 
 
 @pytest.mark.serial
