@@ -154,7 +154,8 @@ def _counted(text: Text, part: tuple[int, int]) -> tuple[int, _Reader]:
 def _gmsh_2(text: Text) -> meshio.Mesh:
     """Gmsh 2.2: a row (number, x) for each node, a row (number, type, n, n tags, nodes) for each cell."""
     from meshio._common import num_nodes_per_cell
-    from meshio.gmsh.common import _gmsh_to_meshio_order, _gmsh_to_meshio_type
+    from meshio.gmsh import gmsh_to_meshio_type
+    from meshio.gmsh.common import _gmsh_to_meshio_order
 
     parts, names = _sections(text)
     count, reader = _counted(text, parts["Nodes"])
@@ -169,7 +170,7 @@ def _gmsh_2(text: Text) -> meshio.Mesh:
     cells, physical, geometrical = [], [], []
     for a, b in pairwise([0, *(np.flatnonzero(np.diff(types)) + 1).tolist(), count]):
         table = values[starts[a] : starts[a] + (b - a) * lengths[a]].reshape(b - a, -1)
-        kind, tags = _gmsh_to_meshio_type[int(types[a])], int(table[0, 2])
+        kind, tags = gmsh_to_meshio_type[int(types[a])], int(table[0, 2])
         corners = num_nodes_per_cell[kind]
         if (lengths[a:b] != 3 + tags + corners).any() or (table[:, 2] != tags).any() or tags < 2:
             raise _UnusualError
@@ -183,7 +184,8 @@ def _gmsh_2(text: Text) -> meshio.Mesh:
 def _gmsh_4(text: Text) -> meshio.Mesh:
     """Gmsh 4.1: nodes and cells by entity, whose physical groups are those of Entities."""
     from meshio._common import num_nodes_per_cell
-    from meshio.gmsh.common import _gmsh_to_meshio_order, _gmsh_to_meshio_type
+    from meshio.gmsh import gmsh_to_meshio_type
+    from meshio.gmsh.common import _gmsh_to_meshio_order
 
     parts, names = _sections(text)
     groups = _physical(_Reader(text, *parts["Entities"])) if "Entities" in parts else None
@@ -193,7 +195,7 @@ def _gmsh_4(text: Text) -> meshio.Mesh:
     sets: dict[str, list[Numbers]] = {name: [] for name in names}
     for _ in range(reader.take(4).tolist()[0]):
         dimension, tag, code, count = reader.take(4).tolist()
-        kind = _gmsh_to_meshio_type[code]
+        kind = gmsh_to_meshio_type[code]
         table = reader.take(count * (1 + num_nodes_per_cell[kind])).reshape(count, -1)
         cells.append((kind, places.of(_gmsh_to_meshio_order(kind, table[:, 1:]))))
         own = [] if groups is None else groups[dimension][tag]

@@ -199,8 +199,10 @@ def size_field(scene: Scene, refine: Refine, aim: float | None, ends: Ends, leng
     return SizeField(ends, np.sqrt(d) * short / across, short / 2, mu, smallest * short)
 
 
-def sampled_cells(scene: Scene, refine: Refine, ends: Ends, base: tuple[Floats, Integers], each: float) -> float:
-    """About how many cells the bisected mesh has, see :func:`bisected_count`.
+def sampled_cells(
+    scene: Scene, refine: Refine, ends: Ends, base: tuple[Floats, Integers], each: float
+) -> tuple[float, bool]:
+    """About how many cells the bisected mesh has, and whether its tolerance grew; see :func:`bisected_count`.
 
     Args:
         ends: singular ends of the body.
@@ -209,7 +211,7 @@ def sampled_cells(scene: Scene, refine: Refine, ends: Ends, base: tuple[Floats, 
     """
     points, cells = base
     if refine.grading == "off":
-        return float(len(cells))
+        return float(len(cells)), False
     lengths = _lengths(points, cells[:: max(len(cells) // MEDIAN_OF, 1)])
 
     def count(shrunk: int) -> float:
@@ -218,12 +220,12 @@ def sampled_cells(scene: Scene, refine: Refine, ends: Ends, base: tuple[Floats, 
 
     found = count(0)
     if refine.tolerance is None or each * found <= refine.most:
-        return found
+        return found, False
     low, high = 0, math.ceil(math.log(1 / refine.tolerance, SHRINK))  # too fine, and as coarse as may be
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if each * count(middle) <= refine.most else (middle, high)
-    return count(high)
+    return count(high), True
 
 
 def sampled_box(scene: Scene, refine: Refine) -> tuple[Whole, Ends, float, float | None]:

@@ -10,7 +10,7 @@ from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.mesh.check import on_boundary
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import check_memory
-from softgrasp.fem.model.refined import SHRINK, by_lines, sampled_box
+from softgrasp.fem.model.refined import by_lines, sampled_box
 from softgrasp.fem.petsc import on_root
 from softgrasp.fem.scene.tissue import Refine
 from softgrasp.study.forward.copies import (
@@ -21,10 +21,10 @@ from softgrasp.study.forward.copies import (
     boundary_nodes,
     coarsened,
     computed,
+    step_text,
     too_many,
 )
 from softgrasp.study.forward.filed import Outline, large, outlined
-from softgrasp.study.report import percent
 
 MOST_TOLERANCE = 0.9  # of a copy [1]
 
@@ -54,9 +54,7 @@ def bisected_copy(scene: Scene, comm: MPI.Intracomm) -> Copy | None:
         f"{NOT_ASSEMBLED}the same scene on coarser cells, n_e = {model.system.layout.n_e}. Sizes with about are "
         f"computed, {SAMPLED[d]} of the unknowns, as cells are counted on a sample."
     )
-    if aim != refine.tolerance:
-        step = percent(SHRINK ** (d / (2 * min(order, 3))) - 1)
-        text += f" tissue.refine.most made the tolerance grow by steps, and one more or less is another {step}."
+    text += step_text(d, order) * outline.grew
     finer = (model.cells / sizes.cells) ** (1 / d)
     boundary, notes = boundary_nodes(d, outline.skin, order), too_many(scene, n_e)
     return Copy(model, sizes, text, finer, boundary, alike=False, ends=outline.ends, notes=notes)
@@ -67,7 +65,7 @@ def _outline(scene: Scene, refine: Refine) -> tuple[Outline, float | None]:
     whole, ends, many, aim = sampled_box(scene, refine)
     points, cells = whole.points, whole.simplices
     skin, held = int(on_boundary(cells, len(points)).sum()), len(np.unique(whole.facet_nodes("contact")))
-    return outlined(points.shape, len(cells), skin, held, 1.0, "").grown(many, ends), aim
+    return outlined(points.shape, len(cells), skin, held, 1.0, "").grown(many, ends, aim != refine.tolerance), aim
 
 
 def _coarser(scene: Scene, refine: Refine, aim: float | None, unknowns: float) -> Scene:

@@ -21,10 +21,11 @@ from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.assembly import discretise
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.memory import box_simplices, check_memory
-from softgrasp.fem.model.refined import by_lines, lined_cells, refined_mesh
+from softgrasp.fem.model.refined import SHRINK, by_lines, lined_cells, refined_mesh
 from softgrasp.fem.scene.scene import check_dimension
 from softgrasp.fem.solve.costs import BUILD
 from softgrasp.study.forward.result import ModelSizes, model_sizes
+from softgrasp.study.report import percent
 
 MOST_LOOKED_AT = {2: 8_000, 3: 6_000}  # unknowns that modes, sag and estimate are computed on
 LOOKED_AT = "Modes, sag and what follows from them are those of "
@@ -141,6 +142,12 @@ def too_many(scene: Scene, n_e: int) -> tuple[str, ...]:
         f"The graded mesh has about {n_e} unknowns, and tissue.refine.most = {refine.most} allows fewer: simulate "
         "refuses a mesh that has more; raise it, or use larger cells.",
     )
+
+
+def step_text(d: int, order: int) -> str:
+    """What to say of a tolerance that grew until its unknowns fit, of which they are a power."""
+    step = percent(SHRINK ** (d / (2 * min(order, 3))) - 1)
+    return f" tissue.refine.most made the tolerance grow by steps, and one more or less is another {step}."
 
 
 def node_pairs_of(counts: Sequence[int], order: int) -> tuple[int, int]:

@@ -26,6 +26,7 @@ from softgrasp.study.forward.copies import (
     boundary_nodes,
     computed,
     node_pairs_of,
+    step_text,
     too_many,
 )
 from softgrasp.study.report import percent
@@ -48,20 +49,23 @@ class Outline(NamedTuple):
     finer: float  # edges of the cells of the file over those of the copy [1]
     differs: str  # by how much, in words
     ends: Ends | None = None  # singular ends of the body, where its cells follow them
+    grew: bool = False  # whether the tolerance of these cells grew until their unknowns fit
 
     def unknowns(self, order: int) -> float:
         """Of the tissue, with elements of this order."""
         d = len(self.counts) - 1
         return float(d * (node_pairs_of(self.counts, order)[0] - self.held * order ** (d - 1)))
 
-    def grown(self, cells: float, ends: Ends) -> Outline:
+    def grown(self, cells: float, ends: Ends, grew: bool) -> Outline:
         """Of a mesh bisected to so many cells, which crowd at singular ends."""
         d, before = len(self.counts) - 1, self.counts[-1]
         ratio = (cells / before) ** ((d - 1) / d)
         even = before / math.factorial(d)  # vertices of a large regular mesh; the others lie on the boundary
         vertices = even + VERTICES[d] * (cells - before) + ratio * (self.counts[0] - even)
         skin, held = (int(ratio * n) for n in (self.skin, self.held))
-        return outlined((int(vertices), d), int(cells), skin, held, self.finer, self.differs)._replace(ends=ends)
+        return outlined((int(vertices), d), int(cells), skin, held, self.finer, self.differs)._replace(
+            ends=ends, grew=grew
+        )
 
 
 def outlined(shape: tuple[int, ...], cells: int, skin: int, held: int, finer: float, differs: str) -> Outline:
@@ -127,7 +131,7 @@ def _copy(scene: Scene, model: Model, outline: Outline) -> Copy:
     text = (
         f"{NOT_ASSEMBLED}a coarser copy of the body with {'even cells and ' * (outline.ends is not None)}quadratic "
         f"elements, n_e = {model.system.layout.n_e}, {outline.differs}. Sizes with about are computed, {exact} of the "
-        "file are not looked for."
+        f"file are not looked for.{step_text(d, order) * outline.grew}"
     )
     boundary = boundary_nodes(d, outline.skin, order)
     notes = too_many(scene, sizes.n_e)
@@ -177,8 +181,8 @@ def _lattice(scene: Scene, body: Body) -> tuple[MeshArrays, Outline] | tuple[Non
     ends = _ends(scene, body, low, high)
     if ends is None:
         return None, None
-    many = sampled_cells(scene, refine, ends, (body.points, body.cells), base / cells)
-    return (copy.arrays, outline.grown(many, ends)) if large(d, order, many) else (None, None)
+    many, grew = sampled_cells(scene, refine, ends, (body.points, body.cells), base / cells)
+    return (copy.arrays, outline.grown(many, ends, grew)) if large(d, order, many) else (None, None)
 
 
 def _ends(scene: Scene, body: Body, low: Floats, high: Floats) -> Ends | None:

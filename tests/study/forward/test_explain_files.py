@@ -170,6 +170,7 @@ def test_cells_that_follow_the_ends_of_a_file_are_counted_on_a_sample(
     np.testing.assert_allclose(copied.time.omega[:3], own.time.omega[:3], rtol=near)
     (said,) = [part.text for part in sections(copied) if part.title == "Mesh"]
     assert "counted on a sample" in said
+    assert ("another 25 %" in said) == ("most" in refine)  # 1.25^(d / 2 p)
 
 
 def test_a_file_with_more_unknowns_than_refinement_allows_is_refused_as_it_is(
