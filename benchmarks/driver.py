@@ -7,7 +7,7 @@ import re
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -146,6 +146,15 @@ def open_console(width: int) -> Console:
     return Console(highlight=False, width=max(Console().width, width), soft_wrap=True)
 
 
+def measure_each[P](console: Console, names: Sequence[str], call: Callable[[str], P]) -> list[P]:
+    """A row for each name, which the terminal shows meanwhile."""
+    rows = []
+    for name in names:
+        with console.status(name):
+            rows.append(call(name))
+    return rows
+
+
 def show_goals(console: Console, goals: Sequence[Goal]) -> None:
     """Print what was to be reached, and whether it is."""
     for goal in goals:
@@ -166,6 +175,14 @@ def write_bench(out: Path, name: str, content: Row, table: Table, markdown: str 
         files.append(out / f"{name}.md")
         files[-1].write_text(markdown)
     return files
+
+
+def finish(console: Console, out: Path, name: str, rows: Sequence[Any], table: Table, goals: Sequence[Goal]) -> None:
+    """Print table and goals, and write NAME.json, NAME.csv and NAME.md of rows that are dataclasses."""
+    console.print(table.terminal())
+    show_goals(console, goals)
+    content = {"command": name, "rows": list(map(asdict, rows)), "goals": goal_rows(goals)}
+    list_bench(console, write_bench(out, name, content, table, table.markdown()))
 
 
 def list_bench(console: Console, files: Sequence[Path], failed: Sequence[Failure] = ()) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -134,13 +134,6 @@ def main(
     """See HELP."""
     names = driver.parse_list(scenes, f"({'|'.join(SCENES)})", f"scene here; there are {', '.join(SCENES)}")
     console = driver.open_console(150)
-    rows = []
-    for name in names:
-        with console.status(name):
-            rows.append(measure(name, materials))
+    rows = driver.measure_each(console, names, lambda name: measure(name, materials))
     table = driver.table_of(rows, COLUMNS, "bounds of outputs at random materials, medians of processor time")
-    console.print(table.terminal())
-    goals = goals_of(rows)
-    driver.show_goals(console, goals)
-    content = {"command": "bench_outputs", "rows": list(map(asdict, rows)), "goals": driver.goal_rows(goals)}
-    driver.list_bench(console, driver.write_bench(out, "bench_outputs", content, table, table.markdown()))
+    driver.finish(console, out, "bench_outputs", rows, table, goals_of(rows))

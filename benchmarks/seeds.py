@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -169,13 +169,6 @@ def main(
     """See HELP."""
     names = driver.parse_list(cases, f"({'|'.join(CASES)})", f"case here; there are {', '.join(CASES)}")
     console = driver.open_console(150)
-    rows = []
-    for name in names:
-        with console.status(name):
-            rows.append(measure(name, seeds))
+    rows = driver.measure_each(console, names, lambda name: measure(name, seeds))
     table = driver.table_of(rows, COLUMNS, "true materials against stated errors, over seeds of the noise")
-    console.print(table.terminal())
-    goals = goals_of(rows)
-    driver.show_goals(console, goals)
-    content = {"command": "bench_seeds", "rows": list(map(asdict, rows)), "goals": driver.goal_rows(goals)}
-    driver.list_bench(console, driver.write_bench(out, "bench_seeds", content, table, table.markdown()))
+    driver.finish(console, out, "bench_seeds", rows, table, goals_of(rows))

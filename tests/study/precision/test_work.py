@@ -48,20 +48,12 @@ from softgrasp.study.precision.tables import question_table
 from softgrasp.study.reduce.run import run_reduce
 from tests.helpers.browser import look
 from tests.helpers.models import Array, graded_model, make_scene, rough_save, write_scene
+from tests.helpers.small_study import SMALL
 
 TOLERANCE, BUDGET = 0.1, 1.0
 WORK, FINEST = 2e5, 3e-3  # of a point of the diagram; tolerance of the finest mesh of the reference
 GOALS = {1: (0.3, 0.1), 2: (0.1, 0.03, 0.01), 3: (0.3, 0.1)}
 FINE, TRUTH = Setting((16, 32), 2, 512), 0.004  # a graded mesh, and what the run on it may be off
-SMALL: dict[str, Any] = {
-    "name": "small",
-    "tissue": {"cells": [4, 8]},
-    "time": {"steps": 64},
-    "motion": {"target": [1.0, 0.5], "duration": 3.0},
-    "control": {"outputs": [{"kind": "node", "point": [0.5, 0.0], "name": "tip"}]},
-    "reduction": {"methods": ["psd_svd_like_fixed", "craig_bampton"], "N": [8, 12]},
-    "study": {"repeats": 1},
-}
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -33,16 +33,7 @@ from softgrasp.study.precision.settings import (
 from softgrasp.study.shell.options import parse_tolerance
 from softgrasp.study.shell.timing import power_law
 from tests.helpers.models import make_scene
-
-SMALL: dict[str, Any] = {
-    "name": "small",
-    "tissue": {"cells": [4, 8]},
-    "time": {"steps": 64},
-    "motion": {"target": [1.0, 0.5], "duration": 3.0},
-    "control": {"outputs": [{"kind": "node", "point": [0.5, 0.0], "name": "tip"}]},
-    "reduction": {"methods": ["psd_svd_like_fixed", "craig_bampton"], "N": [8, 12]},
-    "study": {"repeats": 1},
-}
+from tests.helpers.small_study import SMALL
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,49 +17,28 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.memory import GIB, Need
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import to_scipy
-from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS, make_bases
 from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.parameters import training_of, training_states
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.replay import FullRun, full_run, replay_linear
+from softgrasp.reduction.replay import FullRun, replay_linear
 from softgrasp.reduction.system import ModelError
 from softgrasp.study.reduce.linear import measure
 from softgrasp.study.reduce.linear.measure import FURTHER, box_models, headline_turns, measure_box, sweep, untimed
 from softgrasp.study.reduce.linear.memory import PEAK, check_states
 from softgrasp.study.reduce.linear.ranks import dealt, of_each_rank
 from softgrasp.study.reduce.times import measured_run
+from tests.helpers.full_runs import PAPER, SMALL, made, wanted
 from tests.helpers.models import gather_matrix, gather_rows, gather_states, make_scene
 
-PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"
 PRESERVING = [key for key, method in METHODS.items() if method.preserving]
 EVEN = list(range(4, 61, 2))
-SMALL = ["tissue.cells=[5,10]", "time.steps=120"]
-
-
-def made(scene: Any, comm: MPI.Intracomm = MPI.COMM_WORLD) -> FullRun:
-    model = build(scene, comm=comm)
-    return full_run(model, simulate(model))
 
 
 @pytest.fixture(scope="module")
 def paper() -> FullRun:
     return made(load_scene(PAPER))
-
-
-@pytest.fixture(scope="module")
-def small() -> FullRun:
-    return made(load_scene(PAPER, SMALL))
-
-
-@pytest.fixture(scope="module")
-def coarse() -> FullRun:
-    return made(load_scene(PAPER, ["tissue.cells=[3,6]", "time.steps=60"]))
-
-
-def wanted(against: FullRun, N: list[int]) -> Any:
-    return against.model.scene.reduction.model_copy(update={"N": N})
 
 
 # --- the paper's scene

@@ -16,13 +16,12 @@ from rich.console import Console
 
 from softgrasp.fem.errors import SceneError, SoftgraspError
 from softgrasp.fem.model.build import build
-from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.reduction.archive import load
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS
 from softgrasp.reduction.bases.states import BasisError
 from softgrasp.reduction.parameters import grid_of, outside
-from softgrasp.reduction.replay import FullRun, full_run, replay_linear
+from softgrasp.reduction.replay import FullRun, replay_linear
 from softgrasp.study.reduce.linear.measure import (
     FURTHER,
     headline_turns,
@@ -34,35 +33,15 @@ from softgrasp.study.reduce.run import run_reduce
 from softgrasp.study.reduce.times import FullTimes, Spread, Turns
 from softgrasp.study.shell.timing import processor_seconds
 from tests.helpers.browser import find_chromium, look
+from tests.helpers.full_runs import PAPER, SMALL, made, wanted
 from tests.helpers.models import make_scene
 
-PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"
-SMALL = ["tissue.cells=[5,10]", "time.steps=120"]
 GRAVITY: dict[str, Any] = {
     "tissue": {"cells": [2, 4]},
     "time": {"steps": 40, "start": "equilibrium"},
     "effects": {"gravity": {"g": [0.0, -9.81]}},
     "motion": {"target": [0.5, 0.3], "duration": 1.0},
 }
-
-
-def made(scene: Any) -> FullRun:
-    model = build(scene)
-    return full_run(model, simulate(model))
-
-
-@pytest.fixture(scope="module")
-def small() -> FullRun:
-    return made(load_scene(PAPER, SMALL))
-
-
-@pytest.fixture(scope="module")
-def coarse() -> FullRun:
-    return made(load_scene(PAPER, ["tissue.cells=[3,6]", "time.steps=60"]))
-
-
-def wanted(against: FullRun, N: list[int]) -> Any:
-    return against.model.scene.reduction.model_copy(update={"N": N})
 
 
 def reduced(path: Path, *overrides: str, pictures: bool = True, width: int = 200) -> tuple[dict[str, Any], str]:
