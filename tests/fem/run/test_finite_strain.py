@@ -222,9 +222,12 @@ def test_inverted_start_is_refused() -> None:
 
 
 @pytest.mark.ranks
-@pytest.mark.parametrize("g", [-1.0, -150.0, 20.0])
+@pytest.mark.parametrize("g", [-1.0, -150.0, 0.8])
 def test_equilibrium_is_scikit_fem_s(g: float) -> None:
-    """The static body by Newton's method in another code, to 1e-8; pulled, the strip sags by more than its length."""
+    """The static body by Newton's method in another code, to 1e-8; pulled, the strip sags by more than its length.
+
+    Pushed, it carries 0.8 of the load that buckles it.
+    """
     model = finite(
         STRIP, law="neo-hooke-quadratic", effects={"gravity": {"g": [0.0, g]}}, time={"start": "equilibrium"}
     )
