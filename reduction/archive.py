@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 3"
 TURNING = "softgrasp reduced model in the frame of the hand 1"
 TURNING_STRAIN = "softgrasp reduced model at finite strain in the frame of the hand 1"
-CONTACT = "softgrasp reduced model with contact 1"
+CONTACT = "softgrasp reduced model with contact 2"
 # what h5py and the reading of a model raise of a file that is not whole
 DAMAGE = (OSError, LookupError, TypeError, ValueError, RuntimeError, AttributeError, MemoryError)
 GROUP = "reconstruction"  # of the rows on the mesh; its checksum is an attribute sha256_reconstruction
@@ -85,8 +85,9 @@ def save(model: ReducedModel | StrainModel | TurningModel | ContactModel, path: 
             before stays.
     """
     if isinstance(model, ContactModel):
-        whole = None if model.V is None or model.layout is None else (model.layout, model.V, model.V[:, :0])
-        reconstruction = None if whole is None else Reconstruction(*whole)
+        reconstruction = None
+        if model.V is not None and model.Phi is not None and model.layout is not None:
+            reconstruction = Reconstruction(model.layout, model.V, model.Phi)
         write_model(Path(path), CONTACT, about_contact(model), reconstruction, partial(write_contact, model))
         return
     if isinstance(model, ReducedModel):
@@ -163,8 +164,7 @@ def load(
     """
     with reading(Path(path), layout, scene_hash) as (file, data):
         if file.attrs["format"] == CONTACT:
-            V = None if layout is None else np.asfortranarray(read_reconstruction(file, layout).L_q)
-            return read_contact(file, data, layout, V)
+            return read_contact(file, data, None if layout is None else read_reconstruction(file, layout))
         if file.attrs["format"] == TURNING:
             return read_turning(file, data, layout)
         strained = file.attrs["format"] in (STRAIN, TURNING_STRAIN)

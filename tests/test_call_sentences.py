@@ -46,7 +46,7 @@ from softgrasp.reduction.bases.states import _check
 from softgrasp.reduction.bases.truncation import Part, Truncation, counts_of
 from softgrasp.reduction.bridges import mujoco
 from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.reduction.contact.replay import errors_contact
+from softgrasp.reduction.contact.model import ContactModel
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import run as run_online
 from softgrasp.reduction.strain.model import ReducedStrainSystem, StrainModel
@@ -324,8 +324,8 @@ SENTENCES: list[tuple[Act, str]] = [
     (two_parts, "the snapshots of the displacements are zero"),
     (lambda *_: CertifiedModel._given(SimpleNamespace(drive=None, fine=SimpleNamespace(name="a")), None),  # type: ignore[arg-type]
      "give the motion of the hand, or the force on it; the model has none"),
-    (lambda *_: errors_contact(SimpleNamespace(V=None, layout=None), None, SimpleNamespace(trajectory=SimpleNamespace(  # type: ignore[arg-type]
-        contact=None))), "the contact model was loaded without its columns on the mesh; load it with the layout"),
+    (lambda *_: ContactModel.deformation(SimpleNamespace(V=None), None),  # type: ignore[arg-type]
+     "the contact model was loaded without its columns on the mesh; load it with the layout"),
     (short, "the reduced run has 1 steps, the snapshots reach step "),
     (lambda *_: sg.gradient(made()[0], lambda y: 0.0, dt=0.1), "the gradient of a full model has the steps and the "),
     (lambda *_: run_online(made()[2].at(), dt=0.1), "give either the force on the hand or the motion of the hand"),

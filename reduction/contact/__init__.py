@@ -1,1 +1,1 @@
-"""Reduced models with contact: static responses of the nodes that may touch beside modes, and their compiled run."""
+"""Reduced models with contact: few columns, and static answers of the nodes that may touch; their compiled run."""

@@ -1,8 +1,6 @@
-"""Making of reduced models with contact: V = [K^-1 G, modes, K^-1 N', S^-1 N'm], orthonormal in the mass [CB68].
+"""Making of reduced models with contact: V in the span of K^-1 G and modes, Phi = (K^-1 - V (V'K V)^-1 V') N' [MacN71].
 
-On fine meshes rows of hat functions h_j over several nodes replace those of nodes: mean gaps are >= 0. The last
-columns, S = K + s D + s^2 M, answer the impulse m that stops a face landing at once. A model of N columns is the part
-of a rich one of this kind that a few motions need, see `train.py`.
+A model of N columns is the part of a rich one, of many modes, that a few motions need, see `train.py`.
 """
 
 from __future__ import annotations
@@ -23,7 +21,6 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import make_solver
 from softgrasp.fem.solve.stiffness import static_columns, static_solver
 from softgrasp.fem.system import BlockSystem, dynamic_stiffness
-from softgrasp.reduction.contact.hats import foremost, hat_functions
 from softgrasp.reduction.contact.model import ContactModel, Ints, plane
 from softgrasp.reduction.contact.train import Training, train
 from softgrasp.reduction.origin import origin_of
@@ -33,62 +30,46 @@ if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
 
 PREFIX = "softgrasp_landing_"
+LANDING = 0.8, 3.5, 15.0, 60.0  # s of its answers to a landing over 2 / dt, up to instant ones [1]
 DEPENDENT = 1e-13  # least share of a direction of the basis in its Gram matrix, scaled [1]
-# s of the answers to a landing over 2 / dt, and EACH: chosen with the errors on set_down and the paper's block in
-# sight, also those of the motions that docs/guide calls held out [1].
-LANDING = 0.15, 4.5
-EACH = 6  # modes per such answer, of which the second helps the force and the mode in its place the deformation
-RICH = 60  # modes of a rich model
-RICH_LANDING = 0.01, 0.05, 0.2, 0.8, 3.5, 15.0  # s of its answers to a landing over 2 / dt, from slow to instant [1]
+MODES = 100  # of a rich model, at most
+NOTHING = 1e-12  # share of static answers outside V that is rounding [1]
 
 
-def contact_model(
-    model: Model, modes: int = 10, reach: float | None = None, rows: int | None = None, N: int | None = None
-) -> ContactModel:
-    """The tissue in coordinates z = V a, V = [K^-1 G, modes, K^-1 N', S^-1 N'm] orthonormal in M [CB68]. Collective.
+def contact_model(model: Model, N: int = 30, reach: float | None = None) -> ContactModel:
+    """The tissue in coordinates z = V a + Phi mu, V orthonormal in M, mu the forces of contact. Collective.
 
     Args:
         model: with ``effects.obstacles`` and a hand that does not feel the tissue.
-        modes: number of columns beside the responses to the hand and to the rows, at least 2: clamped modes, and for
-            each direction of the half-spaces an answer to a landing, two from 12 columns per direction on.
-        reach: rows N are kept for boundary nodes that come nearer than this to an obstacle while the undeformed body
-            follows the hand of the scene [m]; None: half the distance of boundary nodes. A run in which another node
-            enters an obstacle is refused.
-        rows: number of hat functions along each half-space in 2D, at least 2, whose mean gaps are >= 0, for N that does
-            not grow with the mesh; None: a row for each node. Of nodes behind each other the foremost is in them.
-        N: number of columns in all, at most; it replaces ``modes`` and ``rows``. The columns beside the responses, and
-            in 2D the number of rows, are those that a rich model needs on the motion of the scene and on others like
-            it, which takes longer. None: no training.
+        N: number of columns of V, at most: the response to the hand, and those that a rich model needs beside it on
+            the motion of the scene and on others like it.
+        reach: boundary nodes that come nearer than this to an obstacle while the undeformed body follows the hand of
+            the scene may touch [m]; None: half the distance of boundary nodes. Of nodes behind each other the foremost
+            may. A run in which another node enters an obstacle is refused.
 
     Raises:
-        ModelError: the scene has other obstacles, no contact or a two-way hand, or no node comes within reach, or N is
-            given with ``rows`` or has too little room.
+        ModelError: the scene has other obstacles, no contact or a two-way hand, or no node comes within reach, or N has
+            too little room.
 
     >>> import softgrasp as sg
-    >>> rom = sg.contact_model(sg.build("set_down", ["tissue.cells=[6, 4]"]), modes=8)
+    >>> rom = sg.contact_model(sg.build("set_down", ["tissue.cells=[6, 4]"]), N=10)
     >>> run = rom.run(*rom.motion(), rom.dt)
     >>> rom.N, bool(run.gap.min() > -1e-12)
-    (17, True)
+    (10, True)
     """
-    if N is None:
-        return _assembled(model, modes, reach, rows)
-    if rows is not None:
-        raise ModelError("rows cannot go with N, which chooses them; give one of both")
     return trained(model, reach).model(N)
 
 
 def trained(model: Model, reach: float | None = None) -> Training:
     """What models of any N are taken from, see :func:`contact_model`. Collective."""
-    return train(_assembled(model, min(RICH, model.system.layout.n_e), reach, rich=True))
+    return train(rich_model(model, reach))
 
 
-def _assembled(
-    model: Model, modes: int, reach: float | None, rows: int | None = None, rich: bool = False
-) -> ContactModel:
-    """A model of given modes and rows; a rich one has the nodes of a face and more answers to a landing. Collective."""
+def rich_model(model: Model, reach: float | None = None) -> ContactModel:
+    """A model of many modes, see :func:`contact_model`. Collective."""
     scene, system = model.scene, model.system
     layout, obstacles = system.layout, check_contact_scene(model)
-    seconds, begin = {}, time.perf_counter()
+    comm, n_s, seconds, begin = layout.comm, layout.n_s, dict[str, float](), time.perf_counter()
     surface, table, dt = (
         make_surface(model.space, system),
         motion_table(scene, layout.n_s),
@@ -98,26 +79,37 @@ def _assembled(
     kept = np.flatnonzero(nearest_gaps(surface, obstacles, table.q, dt, len(table.q)).min(axis=0) < near)
     if not len(kept):
         raise ModelError(f"no boundary node comes within reach = {near:.3g} m of an obstacle; give a larger reach")
-    if rows is not None or rich:  # a hat goes along one face: of what lies above another node none
-        kept = foremost(surface.X, kept, obstacles, near)
-    hats = tuple(hat_functions(surface.X, kept, o, rows) for o in obstacles)
-    V, stiffness = _diagonal(model, _columns(model, surface, kept, obstacles, hats, modes, rich))
+    kept = foremost(surface.X, kept, obstacles, near)
+    forces = _forces(layout.n_local, surface, kept, obstacles)
+    answers = static_columns(system, np.asfortranarray(np.hstack([system.G, forces])))
+    normals = np.unique([plane(o)[0] for o in obstacles], axis=0)
+    shapes = [
+        lowest_modes(system, min(MODES, layout.n_e))[1],
+        *(_landing(system, surface, kept, normals, s * 2 / dt) for s in LANDING),
+    ]
+    V, stiffness = _diagonal(model, np.hstack([answers[:, :n_s], *shapes]))
+    Phi = answers[:, n_s:] - V @ (total(comm, V.T @ forces) / stiffness[:, None])
     seconds["basis"] = time.perf_counter() - begin
     begin = time.perf_counter()
     viscous = viscosity(system, 1.0)
-    D = total(layout.comm, V.T @ times_columns(viscous, V))
+    D = total(comm, V.T @ times_columns(viscous, V))
+    lost = times_columns(viscous, np.asfortranarray(Phi))
     viscous.destroy()
+    sizes = (Phi * lost).sum(), (Phi * forces).sum(), (answers[:, n_s:] * forces).sum()
+    slow, lacking, whole = total(comm, np.array(sizes))
     outputs = make_outputs(scene, system)
-    on = np.zeros((len(surface.dofs), V.shape[1]))
-    on[surface.mine] = V[surface.rows]
+    y = output_columns(outputs, layout.n_local).T
+    on = np.zeros((len(surface.dofs), V.shape[1] + Phi.shape[1]))
+    on[surface.mine] = np.hstack([V, Phi])[surface.rows]
+    on = total(comm, on)
     seconds["projection"] = time.perf_counter() - begin
     return ContactModel(
-        stiffness, (D + D.T) / 2, total(layout.comm, V.T @ system.G),
-        total(layout.comm, output_columns(outputs, layout.n_local).T @ V), np.vstack([o.C_s for o in outputs]),
-        surface.X, surface.T, total(layout.comm, on), kept, hats, obstacles, system.fall, system.damping.drag,
-        scene.time.start == "equilibrium" and system.gravity is not None, table, dt, layout.extent,
+        stiffness, (D + D.T) / 2, total(comm, V.T @ system.G), total(comm, y @ V), np.vstack([o.C_s for o in outputs]),
+        surface.X, surface.T, on[:, : len(stiffness)], on[:, len(stiffness) :],
+        total(comm, y @ Phi), slow / lacking if lacking > NOTHING * whole else 0.0, kept, obstacles, system.fall,
+        system.damping.drag, scene.time.start == "equilibrium" and system.gravity is not None, table, dt, layout.extent,
         tuple(name for o in outputs for name in o.names), model.scene_hash, origin_of(model.scene_keys), seconds,
-        layout, V,
+        layout, V, Phi,
     )  # fmt: skip
 
 
@@ -136,34 +128,27 @@ def check_contact_scene(model: Model) -> tuple[Obstacle, ...]:
     return obstacles
 
 
-def _columns(
-    model: Model, surface: Surface, kept: Ints, obstacles: tuple[Obstacle, ...], hats: tuple[Array, ...], modes: int,
-    rich: bool,
-) -> Array:  # fmt: skip
-    """K^-1 G, K^-1 N', modes and answers to a landing, local rows (n_local, columns). Collective."""
-    system = model.system
-    loads = _responses(model, surface, kept, obstacles, hats)
-    normals = np.unique([plane(o)[0] for o in obstacles], axis=0)
-    answers = RICH_LANDING if rich else LANDING[: max(1, modes // (EACH * len(normals)))]
-    shapes = lowest_modes(system, max(1, modes - len(answers) * len(normals)))[1]
-    fast = 2 * model.scene.time.steps / model.scene.time_end
-    return np.hstack([
-        static_columns(system, np.asfortranarray(np.hstack([system.G, loads]))), shapes,
-        *(_landing(system, surface, kept, normals, s * fast) for s in answers),
-    ])  # fmt: skip
+def foremost(X: Array, kept: Ints, obstacles: tuple[Obstacle, ...], distance: float) -> Ints:
+    """The kept nodes with no other one straight before them at rest, towards the obstacle that is nearest to them."""
+    gaps = np.array([o.gap(X[kept]) for o in obstacles])
+    first = np.ones(len(kept), dtype=bool)
+    for j, o in enumerate(obstacles):
+        n, mine = plane(o)[0], gaps.argmin(axis=0) == j
+        beside = X[kept] - gaps[j][:, None] * n
+        before = gaps[j][None, :] < gaps[j][:, None] - distance
+        close = np.linalg.norm(beside[:, None] - beside[None], axis=2) < distance
+        first &= ~(mine & (before & close).any(axis=1))
+    return kept[first]
 
 
-def _responses(
-    model: Model, surface: Surface, kept: Ints, obstacles: tuple[Obstacle, ...], hats: tuple[Array, ...]
-) -> Array:
-    """N' of the rows, those of equal half-spaces once, local rows (n_local, columns)."""
-    d = surface.X.shape[1]
-    normals = [plane(o)[0] for o in obstacles]
-    each = [j for j, n in enumerate(normals) if not any(np.array_equal(n, other) for other in normals[:j])]
-    whole = np.zeros((len(surface.dofs), sum(len(hats[j]) for j in each)))
-    loads = np.hstack([np.einsum("ri,d->idr", hats[j], normals[j]).reshape(len(kept) * d, -1) for j in each])
-    whole[(kept[:, None] * d + np.arange(d)).ravel()] = loads
-    result = np.zeros((model.system.layout.n_local, whole.shape[1]), order="F")
+def _forces(n_local: int, surface: Surface, kept: Ints, obstacles: tuple[Obstacle, ...]) -> Array:
+    """N' of the rows: a unit force on each node from each obstacle, local rows (n_local, rows)."""
+    d, nodes = surface.X.shape[1], len(kept)
+    whole = np.zeros((len(surface.dofs), len(obstacles) * nodes))
+    for j, o in enumerate(obstacles):
+        for a, component in enumerate(plane(o)[0]):
+            whole[kept * d + a, j * nodes + np.arange(nodes)] = component
+    result = np.zeros((n_local, whole.shape[1]), order="F")
     result[surface.rows] = whole[surface.mine]
     return result
 

@@ -1,9 +1,9 @@
-"""Reduced models with contact: z = V a, V = [K^-1 G, modes, K^-1 N', S^-1 N'm], orthonormal in the mass [CB68].
+"""Reduced models with contact: z = V a + Phi mu, V'M V = I, Phi what V lacks of static answers [MacN71].
 
-Modes alone miss what a force on a node does next to it: nodal forces come out wrong by their own size. With the static
-response of every node that may touch beside them, the answer to slow forces there is exact; the last column, see
-`make.py`, answers the impulse of a face that lands at once. On fine meshes rows of hat
-functions h_j over several nodes replace those of nodes, N_j = sum_i h_j(x_i) N_i / sum_i h_j(x_i): mean gaps are >= 0.
+Columns V alone miss what a force on a node does next to it: nodal forces come out wrong by their own size. Phi is the
+rest of the static answer to a force on each node that may touch, Phi = (K^-1 - V (V'K V)^-1 V') N', so that V'K Phi = 0
+and strain energy splits. It has no mass and follows the forces with the time of the damping, see `stepper.py`; so V is
+left to what moves, and every node within reach has a row at no cost in columns.
 """
 
 from __future__ import annotations
@@ -36,9 +36,11 @@ class ContactRun(Shown):
     times: Array
     """Instants [s], (steps + 1,)."""
     a: Array
-    """Coordinates z = V a, (steps + 1, N) [kg^1/2 m]."""
+    """Coordinates of z = V a + Phi mu, (steps + 1, N) [kg^1/2 m]."""
     v: Array
     """Rates of the coordinates, (steps + 1, N) [kg^1/2 m/s]."""
+    mu: Array
+    """Forces that Phi answers, (steps + 1, rows) [N]."""
     outputs: Array
     """Outputs y, (steps + 1, components) [m, rad]."""
     force: Array
@@ -46,7 +48,7 @@ class ContactRun(Shown):
     row_force: Array
     """The same of each row, along the normal of its obstacle, (steps, rows) [N]."""
     gap: Array
-    """Least gap of each obstacle to the nodes of the rows, (steps + 1, obstacles) [m]; < 0 between hat functions."""
+    """Least gap of each obstacle to the nodes of the rows, (steps + 1, obstacles) [m]."""
     touching: Ints
     """Number of rows that each obstacle presses in each step, (steps, obstacles)."""
 
@@ -69,7 +71,7 @@ class ContactModel(Shown):
 
     >>> import softgrasp as sg
     >>> model = sg.build("set_down", ["tissue.cells=[6, 4]"])
-    >>> rom = sg.contact_model(model, modes=8)
+    >>> rom = sg.contact_model(model, N=10)
     >>> run = rom.run(*rom.motion(), rom.dt)
     >>> run.gap.min() > -1e-12
     True
@@ -91,10 +93,14 @@ class ContactModel(Shown):
     """Rigid modes of the hand there, (p d, n_s) [1, m]."""
     on_surface: Array
     """V on the boundary, (p d, N)."""
+    Phi_on_surface: Array
+    """Phi there, (p d, rows) [m/N]; the rows are those of each node before the first obstacle, the second, ..."""
+    C_Phi: Array
+    """C'Phi of the outputs, (components, rows)."""
+    lag: float
+    """Kelvin-Voigt time of Phi, tr Phi'D Phi / tr Phi'K Phi [s]."""
     kept: Ints
     """Numbers of the boundary nodes that have rows, (nodes,)."""
-    hats: tuple[Array, ...]
-    """Shares of these nodes in the rows of each obstacle, (rows, nodes) each [1]."""
     obstacles: tuple[Obstacle, ...]
     """Half-spaces."""
     fall: Array
@@ -120,7 +126,9 @@ class ContactModel(Shown):
     layout: BlockLayout | None = None
     """Of the unknowns of z on the ranks; None when loaded without a mesh."""
     V: Array | None = None
-    """Columns of z = V a of this rank's rows, (n_local, N) [kg^-1/2]; None when loaded without a mesh."""
+    """Columns of this rank's rows, (n_local, N) [kg^-1/2]; None when loaded without a mesh."""
+    Phi: Array | None = None
+    """The same of Phi, (n_local, rows) [m/N]."""
 
     @property
     def N(self) -> int:
@@ -133,11 +141,27 @@ class ContactModel(Shown):
             ("dimension", f"N = {self.N}"),
             (
                 "contact",
-                f"{counted(len(self.hats[0]), 'row')} on {counted(len(self.kept), 'node')} before "
-                f"{counted(len(self.obstacles), 'half-space')}",
+                f"{counted(len(self.kept), 'node')} before {counted(len(self.obstacles), 'half-space')}",
             ),
         )
         return Card("ContactModel", rows)
+
+    def deformation(self, run: ContactRun, part: slice = slice(None)) -> Array:
+        """Of this rank's rows at instants of a run, z = V a + Phi mu, (n_local, instants) [m].
+
+        Raises ModelError: the model has no columns on the mesh.
+        """
+        if self.V is None or self.Phi is None:
+            raise ModelError("the contact model was loaded without its columns on the mesh; load it with the layout")
+        return np.asarray(self.V @ run.a[part].T + self.Phi @ run.mu[part].T)
+
+    def rows(self) -> tuple[Array, Array]:
+        """N of each node before each obstacle on V, (rows, N) [kg^-1/2], and F = N Phi, (rows, rows) [m/N]."""
+        d = self.X.shape[1]
+        V, Phi = (x.reshape(len(self.X), d, -1)[self.kept] for x in (self.on_surface, self.Phi_on_surface))
+        normals = [plane(o)[0] for o in self.obstacles]
+        N, F = (np.vstack([np.einsum("i,jik->jk", n, x) for n in normals]) for x in (V, Phi))
+        return np.ascontiguousarray(N), np.ascontiguousarray((F + F.T) / 2)
 
     def motion(self) -> tuple[Array, Array]:
         """Position and velocity of the hand in the scene, (steps + 1, n_s) each [m, rad; m/s, rad/s]."""
@@ -171,45 +195,41 @@ class ContactModel(Shown):
         c = -(np.diff(v, axis=0) / dt - self.fall + self.drag * (v[1:] + v[:-1]) / 2)
         start = self.G @ self.fall / self.stiffness if self.equilibrium else np.zeros(self.N)
         T, t = self.T.reshape(-1, d, q.shape[1])[self.kept], dt * np.arange(steps + 1.0)
-        N, gaps, rates, normals = [], [], [], []
+        gaps, rates = [], []
         for obstacle in self.obstacles:
             n, offset = plane(obstacle)
-            N.append(np.einsum("i,jik->jk", n, self.on_surface.reshape(-1, d, self.N)[self.kept]))
             lift = np.einsum("i,jis->js", n, T)
             shift, speed = (_moved(obstacle, t, order) for order in (0, 1))
             gaps.append(self.X[self.kept] @ n - offset + q @ lift.T - shift[:, None])
             rates.append(v @ lift.T - speed[:, None])
-            normals.append(n)
-        hats = self.hats
-        rows = np.vstack([H @ each for H, each in zip(hats, N, strict=True)])
-        gap, rate = (
-            np.ascontiguousarray(np.hstack([x @ H.T for H, x in zip(hats, each, strict=True)]))
-            for each in (gaps, rates)
-        )
+        N, F = self.rows()
+        gap, rate = (np.ascontiguousarray(np.hstack(each)) for each in (gaps, rates))
         tol = ROUNDING * (float(np.abs(self.X).max() + np.abs(q).max(initial=0.0)) + self.extent)
-        stepper = ContactSteps(self.stiffness, self.D, np.ascontiguousarray(rows), dt)
-        a, rate_a, x, y = stepper.march(start, np.ascontiguousarray(c @ self.G.T), gap, rate, tol, engine)
-        self._check(a, q, t, tol)
-        least = [(each + a @ n.T).min(axis=1) for each, n in zip(gaps, N, strict=True)]
-        ends = np.cumsum([len(H) for H in hats])[:-1]
+        stepper = ContactSteps(self.stiffness, self.D, N, F, self.lag, dt)
+        a, rate_a, x, y, mu = stepper.march(start, np.ascontiguousarray(c @ self.G.T), gap, rate, tol, engine)
+        self._check(a, mu, q, t, tol)
+        shape = (-1, len(self.obstacles), len(self.kept))
+        least = (gap + a @ N.T + mu @ F).reshape(shape).min(axis=2)
         pressed = x + y / dt
-        parts = zip(np.split(pressed, ends, axis=1), normals, strict=True)
-        force = np.stack([part.sum(axis=1)[:, None] * n for part, n in parts], axis=1)
-        touching = np.column_stack([(part > 0).sum(axis=1) for part in np.split(x, ends, axis=1)])
-        outputs = a @ self.C.T + q @ self.C_s.T
-        return ContactRun(t, a, rate_a, outputs, force, pressed, np.column_stack(least), touching)
+        normals = np.array([plane(o)[0] for o in self.obstacles])
+        force = pressed.reshape(shape).sum(axis=2)[:, :, None] * normals
+        touching = (x.reshape(shape) > 0).sum(axis=2)
+        outputs = a @ self.C.T + mu @ self.C_Phi.T + q @ self.C_s.T
+        return ContactRun(t, a, rate_a, mu, outputs, force, pressed, least, touching)
 
-    def _check(self, a: Array, q: Array, t: Array, tol: float) -> None:
+    def _check(self, a: Array, mu: Array, q: Array, t: Array, tol: float) -> None:
         """Raise ModelError where a boundary node without a row is in an obstacle, or any one at the start."""
         p, d = self.X.shape
         others = np.setdiff1d(np.arange(p), self.kept)
         for obstacle in self.obstacles:
             n, offset = plane(obstacle)
-            V, T = (np.einsum("i,jik->jk", n, x.reshape(p, d, -1)) for x in (self.on_surface, self.T))
+            V, Phi, T = (
+                np.einsum("i,jik->jk", n, x.reshape(p, d, -1)) for x in (self.on_surface, self.Phi_on_surface, self.T)
+            )
             shift = _moved(obstacle, t, 0)
             for first in range(0, len(t), CHUNK):
                 part = slice(first, first + CHUNK)
-                gap = self.X @ n - offset + a[part] @ V.T + q[part] @ T.T - shift[part, None]
+                gap = self.X @ n - offset + a[part] @ V.T + mu[part] @ Phi.T + q[part] @ T.T - shift[part, None]
                 looked = gap[:, others].min(initial=np.inf)
                 if first == 0 and gap[0].min() < -tol:
                     raise ModelError(f"obstacle '{obstacle.name}' is {-gap[0].min():.2g} m in the tissue at the start")

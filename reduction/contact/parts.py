@@ -6,15 +6,14 @@ from typing import Any
 
 import h5py
 
-from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.obstacles import HalfSpace, Obstacle
 from softgrasp.fem.obstacles.obstacle import Path, Spline, Uniform
-from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import HandTable
 from softgrasp.reduction.contact.model import ContactModel, plane
+from softgrasp.reduction.operators import Reconstruction
 
-KEYS = ("N", "drag", "equilibrium", "dt", "extent", "scene_hash", "origin", "seconds")
-ARRAYS = ("stiffness", "D", "G", "C", "C_s", "X", "T", "on_surface", "kept", "fall")
+KEYS = ("N", "drag", "lag", "equilibrium", "dt", "extent", "scene_hash", "origin", "seconds")
+ARRAYS = ("stiffness", "D", "G", "C", "C_s", "X", "T", "on_surface", "Phi_on_surface", "C_Phi", "kept", "fall")
 
 
 def about_contact(model: ContactModel) -> dict[str, Any]:
@@ -30,19 +29,21 @@ def write_contact(model: ContactModel, file: h5py.File) -> None:
         file[f"parts/{key}"] = getattr(model, key)
     for key in ("q", "v", "a"):
         file[f"hand/{key}"] = getattr(model.table, key)
-    for i, (obstacle, hats) in enumerate(zip(model.obstacles, model.hats, strict=True)):
+    for i, obstacle in enumerate(model.obstacles):
         group = file.create_group(f"obstacles/{i}")
         group["normal"], group["offset"] = plane(obstacle)
-        group["hats"] = hats
         if isinstance(obstacle.path, Uniform):
             group["velocity"] = obstacle.path.velocity
         elif isinstance(obstacle.path, Spline):
             group["times"], group["coefficients"] = obstacle.path.spline.x, obstacle.path.spline.c
 
 
-def read_contact(file: h5py.File, data: dict[str, Any], layout: BlockLayout | None, V: Array | None) -> ContactModel:
+def read_contact(file: h5py.File, data: dict[str, Any], reconstruction: Reconstruction | None) -> ContactModel:
     """The model of an open file, with its columns on the mesh or without."""
     data.pop("N")
+    on_mesh: dict[str, Any] = {}
+    if reconstruction is not None:
+        on_mesh = {"layout": reconstruction.layout, "V": reconstruction.L_q, "Phi": reconstruction.L_v}
     names, given = tuple(data.pop("names")), data.pop("obstacles")
     groups = [file[f"obstacles/{i}"] for i in range(len(given))]
     obstacles = tuple(
@@ -52,12 +53,10 @@ def read_contact(file: h5py.File, data: dict[str, Any], layout: BlockLayout | No
     return ContactModel(
         **data,
         **{key: file[f"parts/{key}"][()] for key in ARRAYS},
-        hats=tuple(g["hats"][()] for g in groups),
         obstacles=obstacles,
         table=HandTable(*(file[f"hand/{key}"][()] for key in ("q", "v", "a"))),
         names=names,
-        layout=layout,
-        V=V,
+        **on_mesh,
     )
 
 

@@ -22,7 +22,7 @@ class ContactErrors(Shown):
     """Errors of a reduced run with contact."""
 
     z: float
-    """|Z - V A| / |Z| of the deformation over all nodes and steps [1]."""
+    """|Z - Z_r| / |Z| of the deformation over all nodes and steps [1]."""
     force: float | None
     """|F - F_r| / |F| of the forces of all obstacles over all steps [1]; None where the full run never touches."""
 
@@ -51,15 +51,13 @@ def errors_contact(rom: ContactModel, run: ContactRun, full: FullRun) -> Contact
     Raises ModelError: the model has no columns on the mesh, or the runs have other steps.
     """
     contact = full.trajectory.contact
-    if rom.V is None or rom.layout is None:
-        raise ModelError("the contact model was loaded without its columns on the mesh; load it with the layout")
     if contact is None or len(run.times) != full.snapshots.Z.shape[1]:
         raise ModelError("the full run has other steps than the reduced one, or no contact")
-    Z, off = full.snapshots.Z[: len(rom.V)], 0.0
+    Z, off = full.snapshots.Z[: full.snapshots.layout.n_local], 0.0
     for first in range(0, Z.shape[1], 64):  # instants
         part = slice(first, first + 64)
-        off += float(((rom.V @ run.a[part].T - Z[:, part]) ** 2).sum())
-    missed, size = total(rom.layout.comm, np.array([off, float((Z**2).sum())]))
+        off += float(((rom.deformation(run, part) - Z[:, part]) ** 2).sum())
+    missed, size = total(full.snapshots.layout.comm, np.array([off, float((Z**2).sum())]))
     force = float(np.linalg.norm(contact.force))
     missed_force = float(np.linalg.norm(run.force - contact.force))
     return ContactErrors(float(np.sqrt(missed / size)), missed_force / force if force > 0 else None)

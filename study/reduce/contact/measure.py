@@ -14,6 +14,7 @@ from softgrasp.reduction.contact.make import check_contact_scene, trained
 from softgrasp.reduction.contact.model import ContactModel, ContactRun, plane
 from softgrasp.reduction.contact.motions import ASIDE, tangent
 from softgrasp.reduction.contact.replay import errors_contact, replay_contact
+from softgrasp.reduction.contact.train import NUMBERS
 from softgrasp.reduction.parameters import moved_to
 from softgrasp.study.reduce.times import FullTimes, Say
 from softgrasp.study.shell import median_processor_seconds
@@ -26,14 +27,12 @@ DEEP, DEEPER = 1.05, 1.15  # ways of held-out motions towards the first obstacle
 class ContactPoint:
     """One model."""
 
-    rows: str  # what has a row: nodes or hat functions
-    count: int  # rows before each half-space
-    N: int  # dimension
+    N: int  # columns
+    nodes: int  # that may touch
     error: float  # of z on the motion of the scene [1]
     error_force: float | None  # of the forces there; None where nothing touches [1]
     error_held_out: float | None  # largest error of z on the other motions; None without any [1]
     error_force_held_out: float | None  # largest error of the forces on them; None without any [1]
-    depth: float  # largest depth of a boundary node in an obstacle on all motions [m]
     time_offline: float  # responses, modes and projection [s]
     time_setup: float  # of a new parameter, which needs a new model [s]
     time_online: float  # a run [s]
@@ -78,7 +77,7 @@ def measure_contact(full: FullRun, times: FullTimes, say: Say) -> ContactStudy:
     comm = model.system.layout.comm
     models = _models(model, refused, say)
     own: dict[str, tuple[float, float | None]] = {}
-    depth, seconds, runs = dict[str, float](), dict[str, float](), dict[str, ContactRun]()
+    seconds, runs = dict[str, float](), dict[str, ContactRun]()
     for key, rom in list(models.items()):
         try:
             runs[key] = run = replay_contact(rom, full)
@@ -87,7 +86,7 @@ def measure_contact(full: FullRun, times: FullTimes, say: Say) -> ContactStudy:
             del models[key]
             continue
         found = errors_contact(rom, run, full)
-        own[key], depth[key] = (found.z, found.force), max(0.0, -float(run.gap.min()))
+        own[key] = found.z, found.force
         seconds[key] = median_processor_seconds(comm, partial(rom.run, *full.hand, full.dt), RUNS)
     if not models:
         raise ReductionError(f"no reduced model with contact: {'; '.join(f'{k}: {v}' for k, v in refused.items())}")
@@ -99,17 +98,13 @@ def measure_contact(full: FullRun, times: FullTimes, say: Say) -> ContactStudy:
         say("held-out motion", i, len(jobs))
         other, motion, answers = _try_motion(full, models, title, target, refused)
         motions.append(motion)
-        for key, run in answers.items():
-            depth[key] = max(depth[key], -float(run.gap.min()))
         if first in answers and motion.errors[first][0] > furthest:
             furthest, shown = motion.errors[first][0], (title, other, answers[first])
     points = {
-        key: ContactPoint(
-            key.split("_")[0], len(rom.hats[0]), rom.N, *own[key], *_largest(key, motions), depth[key],
-            sum(rom.seconds.values()), sum(rom.seconds.values()), seconds[key],
-        )
+        key: ContactPoint(rom.N, len(rom.kept), *own[key], *_largest(key, motions), made, made, seconds[key])
         for key, rom in models.items()
-    }  # fmt: skip
+        for made in [sum(rom.seconds.values())]
+    }
     return ContactStudy(full, times, points, models, motions, refused, shown)
 
 
@@ -148,13 +143,12 @@ def _try_motion(
 
 
 def _models(model: Model, refused: dict[str, str], say: Say) -> dict[str, ContactModel]:
-    """Models by rows and dimension. Collective. Raises ReductionError: no given N is possible."""
+    """Models by their number of columns. Collective. Raises ReductionError: no given N is possible."""
     options, models = model.scene.reduction, dict[str, ContactModel]()
     say("reduced model", 0, 1)
     training = trained(model)
-    nodes = len(training.rich.kept)
     given = "N" in options.model_fields_set
-    numbers = sorted(set(options.N), reverse=True) if given else training.numbers
+    numbers = sorted(set(options.N), reverse=True) if given else NUMBERS
     for i, N in enumerate(numbers):
         say("reduced model", i, len(numbers))
         try:
@@ -162,7 +156,7 @@ def _models(model: Model, refused: dict[str, str], say: Say) -> dict[str, Contac
         except ModelError as error:
             refused[f"N = {N}"] = str(error)
             continue
-        models.setdefault(f"{'nodes' if len(rom.hats[0]) == nodes else 'hats'}_{rom.N}", rom)
+        models.setdefault(f"contact_{rom.N}", rom)
     if not models:
         raise ReductionError(f"reduction.N has no possible dimension: {next(iter(refused.values()))}")
     return models

@@ -16,18 +16,17 @@ CAPTIONS = {
     "accurate reduced one.",
 }
 NOTE = (
-    "The basis has the response to the hand, that to every row, which is a boundary node that may touch or a hat "
-    "function over several, and what a rich model needs beside them on the motion of the scene and on others along and "
-    "towards the obstacle; these choose the number of rows too. z: relative error of the deformation over all nodes "
-    "and steps; force: of the forces of all obstacles over all steps. Held out: largest on motions that trained no "
-    "model. depth: of a node in an obstacle, which hat functions allow between them."
+    "The basis has the response to the hand and what a rich model needs beside it on the motion of the scene and on "
+    "others along and towards the obstacle. Every node that may touch has a row; the static answer to its force that "
+    "the basis lacks goes with the force, without mass. z: relative error of the deformation over all nodes and steps; "
+    "force: of the forces of all obstacles over all steps. Held out: largest on motions that trained no model."
 )
 ERRORS: Columns = {
-    "rows": "p.rows", "count": "p.count", "N": "p.N", "z": "p.error %3", "force": "p.error_force %3",
-    "z held out": "p.error_held_out %3", "force held out": "p.error_force_held_out %3", "depth [m]": "p.depth .2g",
+    "N": "p.N", "nodes": "p.nodes", "z": "p.error %3", "force": "p.error_force %3",
+    "z held out": "p.error_held_out %3", "force held out": "p.error_force_held_out %3",
 }  # fmt: skip
 TIMES: Columns = {
-    "rows": "p.rows", "N": "p.N", "run [ms]": lambda r: f"{1e3 * r['p'].time_online:.2f}",
+    "N": "p.N", "run [ms]": lambda r: f"{1e3 * r['p'].time_online:.2f}",
     "step [us]": lambda r: f"{1e6 * r['p'].time_online / r['steps']:.2f}", "offline [s]": "p.time_offline 3",
     "x full": "up .3g",
 }  # fmt: skip

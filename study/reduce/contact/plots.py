@@ -12,8 +12,6 @@ import numpy as np
 from softgrasp.study.pictures import save, style
 from softgrasp.study.reduce.contact.measure import ContactPoint, ContactStudy
 
-TITLES = {"nodes": "a row for each node", "hats": "rows of hat functions"}
-
 
 def draw(out: Path, study: ContactStudy) -> list[Path]:
     """Both figures. Rank 0 only."""
@@ -24,11 +22,9 @@ def figure_errors(study: ContactStudy, out_png: Path) -> tuple[Path, ...]:
     """Errors of z and of the forces against N."""
     with style.paper_style():
         figure, axes = plt.subplots(1, 2, figsize=(style.WIDTH, 2.8), layout="constrained")
-        for rows, colour in zip(TITLES, (style.BLUE, style.ORANGE), strict=True):
-            points = sorted((p for p in study.points.values() if p.rows == rows), key=lambda p: p.N)
-            if points:
-                _pair(axes[0], points, ("error", "error_held_out"), colour, TITLES[rows])
-                _pair(axes[1], points, ("error_force", "error_force_held_out"), colour, TITLES[rows])
+        points = sorted(study.points.values(), key=lambda p: p.N)
+        _pair(axes[0], points, ("error", "error_held_out"))
+        _pair(axes[1], points, ("error_force", "error_force_held_out"))
         for ax, label in zip(axes, ("error of the deformation z [1]", "error of the forces [1]"), strict=True):
             ax.set(xlabel="N, columns of the basis", ylabel=label)
             style.log_axis(ax, None)
@@ -39,13 +35,15 @@ def figure_errors(study: ContactStudy, out_png: Path) -> tuple[Path, ...]:
         return tuple(save(figure, out_png))
 
 
-def _pair(ax: Any, points: Sequence[ContactPoint], keys: tuple[str, str], colour: str, label: str) -> None:
+def _pair(ax: Any, points: Sequence[ContactPoint], keys: tuple[str, str]) -> None:
     """Filled marks for the motion of the scene, open ones for the largest held-out error."""
     N = [p.N for p in points]
-    for key, look, fill, words in zip(keys, ("o-", "o--"), ("full", "none"), ("", ", held out"), strict=True):
+    for key, look, fill, label in zip(
+        keys, ("o-", "o--"), ("full", "none"), ("motion of the scene", "largest on held-out motions"), strict=True
+    ):
         values = [np.nan if (x := getattr(p, key)) is None else x for p in points]
         if not np.isnan(values).all():
-            ax.plot(N, values, look, color=colour, ms=3.8, fillstyle=fill, label=label + words)
+            ax.plot(N, values, look, color=style.BLUE, ms=3.8, fillstyle=fill, label=label)
 
 
 def figure_force(study: ContactStudy, out_png: Path) -> tuple[Path, ...]:
