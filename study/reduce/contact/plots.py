@@ -26,7 +26,7 @@ def figure_errors(study: ContactStudy, out_png: Path) -> tuple[Path, ...]:
         _pair(axes[0], points, ("error", "error_held_out"))
         _pair(axes[1], points, ("error_force", "error_force_held_out"))
         for ax, label in zip(axes, ("error of the deformation z [1]", "error of the forces [1]"), strict=True):
-            ax.set(xlabel="N, columns of the basis", ylabel=label)
+            ax.set(xlabel="N, columns of the basis", ylabel=label, xticks=[p.N for p in points])
             style.log_axis(ax, None)
             low, high = ax.dataLim.intervaly
             ax.set_ylim(10 ** np.floor(np.log10(low)), 10 ** np.ceil(np.log10(high)))
