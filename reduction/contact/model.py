@@ -235,8 +235,8 @@ class ContactModel(Shown):
                     raise ModelError(f"obstacle '{obstacle.name}' is {-gap[0].min():.2g} m in the tissue at the start")
                 if looked < -tol:
                     raise ModelError(
-                        f"a boundary node without a row is {-looked:.2g} m in obstacle '{obstacle.name}'; give "
-                        "contact_model a larger reach"
+                        f"a boundary node beyond the reach of the model is {-looked:.2g} m in obstacle "
+                        f"'{obstacle.name}'; give contact_model a larger reach"
                     )
 
 
