@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import dolfinx.mesh
 import numpy as np
@@ -11,12 +12,16 @@ import scipy.sparse
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.assembly import Discretisation
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.points import Parts, facet_points
 from softgrasp.fem.petsc import Array, rows_on_all, total
 from softgrasp.fem.system import BlockSystem
+
+if TYPE_CHECKING:
+    from softgrasp.fem.obstacles import Obstacle
 
 
 @dataclass(frozen=True)
@@ -99,3 +104,25 @@ def contains(space: Discretisation, points: Array) -> NDArray[np.bool_]:
         found[i] = ((shares >= 0).all(axis=1) & (shares.sum(axis=1) <= 1)).any()
     space.layout.comm.Allreduce(MPI.IN_PLACE, found, MPI.LOR)
     return found
+
+
+def refuse_within(space: Discretisation, obstacles: Sequence[Obstacle], boundary: Array, shift: Array | float) -> None:
+    """Refuse an obstacle that the boundary goes round at the start, which nothing can touch. Collective.
+
+    Args:
+        space: of the undeformed body.
+        boundary: places of its nodes at the start, (p, d) [m].
+        shift: way of the hand until then, (d,) [m].
+
+    Raises SceneError: there is one.
+    """
+    middles = [(o, x + o.shift(0.0)) for o in obstacles if (x := o.shape.middle()) is not None]
+    if not middles:
+        return
+    within = contains(space, np.array([x for _, x in middles]) - shift)
+    for (o, _), inside in zip(middles, within, strict=True):
+        if inside and o.gap(boundary).min() > 0:
+            raise SceneError(
+                f"obstacle '{o.name}' has its middle within the tissue at the start, and no point of the boundary in "
+                "it; move it"
+            )

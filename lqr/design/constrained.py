@@ -11,6 +11,7 @@ import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.fem.model.surface import refuse_within
 from softgrasp.fem.obstacles import make_obstacles
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.constrained.horizon import held_plant
@@ -202,7 +203,10 @@ def _noise(
 
 
 def require_plan(model: Model) -> None:
-    """Raises ControlError: the scene has no plan, whatever its gain. Collective."""
+    """See that a scene may have a plan, whatever its gain. Collective.
+
+    Raises ControlError: it has none. Raises SceneError: an obstacle is within the body, whose boundary keeps gaps.
+    """
     plant, given = problem(model), control_of(model)
     require_plannable(plant)
     if plant.system.two_way:
@@ -217,6 +221,8 @@ def require_plan(model: Model) -> None:
                 "the tissue swings between them: leave out speed, or effects.reaction"
             )
     given_force(model, plant.layout.n_s)
+    if (surface := body_surface(model)).kept is None:
+        refuse_within(model.space, make_obstacles(model.scene, plant.layout.dimension), surface.nodes, 0.0)
     if model.system.gravity is not None and model.scene.time.start != "equilibrium":
         raise ControlError(SWINGS)
 

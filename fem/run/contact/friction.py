@@ -163,6 +163,7 @@ class FrictionContact(Contact):
         obstacle, node, axes = (np.repeat(rows.obstacle, d := self.d), np.repeat(rows.node, d), along.reshape(-1, d))
         A = np.ascontiguousarray(self.strike.reactions().matrix(node, axes))
         self.jolt.fit(len(rows.node))
+        self.jolt.forget()  # a restart does not find what an A that stays has led to
         self.jolt.kind[:], self.jolt.e[:] = rows.kind, rows.e
         x, slips, mean = np.column_stack([rows.x, rows.x_t]), rows.kind == SLIP, speed.copy()
         rubbed = float(np.einsum("ka,ka->", rows.x_t[slips], rows.slip[slips]))  # of others it is rounding

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.surface import contains
+from softgrasp.fem.model.surface import refuse_within
 from softgrasp.fem.obstacles.compiled import contact_library
-from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.contact.flat import FlatContact
 from softgrasp.fem.run.contact.general import Contact
 from softgrasp.fem.run.contact.touching import Touching
@@ -62,26 +58,9 @@ def make_contact(
     contact = begin_contact(model, midpoint, steps, hand)
     if isinstance(drive, TableDrive):
         contact.check_hand(drive.q, 0, steps + 1)
-    _refuse_within(model, contact, drive.q[0])
+    q = drive.q[0]
+    refuse_within(model.space, contact.obstacles, contact.surface.places(q), q[: contact.d])
     return ContactDrive(drive, contact), contact
-
-
-def _refuse_within(model: Model, contact: Contact, q: Array) -> None:
-    """Refuse an obstacle that the boundary with the hand at q (n_s,) goes round, which nothing can touch. Collective.
-
-    Raises SceneError: there is one.
-    """
-    middles = [(o, x + o.shift(0.0)) for o in contact.obstacles if (x := o.shape.middle()) is not None]
-    if not middles:
-        return
-    within = contains(model.space, np.array([x for _, x in middles]) - q[: contact.d])
-    boundary = contact.surface.places(q)
-    for (o, _), inside in zip(middles, within, strict=True):
-        if inside and o.gap(boundary).min() > 0:
-            raise SceneError(
-                f"obstacle '{o.name}' has its middle within the tissue at the start, and no point of the boundary in "
-                "it; move it"
-            )
 
 
 def begin_contact(model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> Contact:

@@ -28,6 +28,7 @@ SMALL = [
 ]
 BETA = "effects.damping={kind='kelvin-voigt', beta=0.01}"
 SIDE = "motion={target=[0.4, -0.05], duration=1.0}"
+LEDGE = "obstacle=[{kind='box', lo=[0.1, -0.53], hi=[2, -0.03], friction=0.3}]"
 TWO = ["effects.reaction=true", "hand={mass=2.0}", "effects.gravity={g=[0, -1], hand_weight=true}"]
 DRIVEN = [*TWO, "motion={profile='hold', drive='force'}"]
 
@@ -250,6 +251,7 @@ def test_every_step_of_friction_takes_energy(monkeypatch: pytest.MonkeyPatch) ->
     [
         ([SIDE, table(0.4)], 70),
         ([SIDE, DISC], 70),
+        (["motion={profile='hold'}", "time={steps=130, end=1.3}", LEDGE], 60),  # impulses on the same rows again
         ([SIDE, table(0.3)], 15),  # when the last step has met nodes that the one before has not
         ([*DRIVEN, table(0.3)], 29),  # whose nodes came one after the other
     ],

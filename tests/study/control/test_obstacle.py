@@ -126,6 +126,7 @@ def test_error_of_the_linear_plant_becomes_a_margin_on_request(tmp_path: Path) -
         ("control.constraints.horizon=1e9", "a plan of 1e+09 intervals would need about"),
         ("control.constraints.grid=1e4", "raise control.constraints.N or lower grid"),
         ("control.constraints.N=9", "N is 9; displacements and velocities come in pairs"),
+        ("obstacle=[{kind='disc', center=[0.4, 1.1], radius=0.1}]", "'disc1' has its middle within the tissue"),
         ("control.constraints=false", "obstacle is given but nothing in this scene uses it"),
     ],
 )
