@@ -115,17 +115,17 @@ def _nodes_alone(entries: list[Obstacle], order: int, d: int, longest: float) ->
 def out_of_reach(model: Model, strain: float, length: float) -> list[str]:
     """Obstacles that a body which moves with the hand stays clear of by more than it deforms. Collective.
 
-    The gap is that of its boundary nodes at some instants of a prescribed motion, and the deformation is estimated as
-    `OVERSHOOT` times ``strain``, the static rms gradient under the largest load [1], times ``length`` [m].
+    The gap is that of the points that can touch, at some instants of a prescribed motion. The deformation is estimated
+    as `OVERSHOOT` times ``strain``, the static rms gradient under the largest load [1], times ``length`` [m].
     """
     scene, system = model.scene, model.system
     if not scene.effects.obstacles or scene.motion.drive == "force":
         return []
-    from softgrasp.fem.model.surface import make_surface  # only scenes with contact pay for it
-    from softgrasp.fem.obstacles import make_obstacles
+    from softgrasp.fem.obstacles import make_obstacles  # only scenes with contact pay for it
     from softgrasp.fem.run.contact.expected import nearest_gaps
+    from softgrasp.fem.run.contact.general import contact_surface
 
-    surface, q = make_surface(model.space, system), motion_table(scene, system.layout.n_s).q
+    surface, q = contact_surface(model), motion_table(scene, system.layout.n_s).q
     obstacles = make_obstacles(scene, system.layout.dimension)
     gap = float(nearest_gaps(surface, obstacles, q, scene.time_end / scene.time.steps).min())
     margin = OVERSHOOT * strain * length

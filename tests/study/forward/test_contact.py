@@ -118,6 +118,14 @@ def test_explain_advises_to_drop_obstacles_that_the_path_stays_clear_of(offset: 
         assert touched.gap.min() > 4.7 - margin
 
 
+def test_a_pin_that_only_points_between_nodes_touch_is_not_said_to_be_out_of_reach() -> None:
+    pin = "obstacle=[{kind='disc', center=[0.5, -0.05], radius=0.03}]"
+    path = ["motion={target=[0.0, -0.04], duration=1.0}", "time={steps=60, end=1.0}"]
+    model = build("paper_forward", ["tissue.cells=[1, 2]", "effects.obstacles=true", *path, pin])
+    assert simulate(model).contact.touching.any()  # no node comes nearer than 0.4
+    assert not [text for text in explain_model(model).warnings if "stays" in text]
+
+
 def test_a_run_begins_with_the_warning_of_a_small_obstacle(tmp_path: Path) -> None:
     pin = "obstacle=[{name='pin', kind='disc', center=[0.5, -0.5], radius=0.1, parts=2}]"
     console = Console(record=True, quiet=False, file=io.StringIO())
