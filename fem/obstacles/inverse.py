@@ -17,6 +17,9 @@ NONE = np.zeros((0, 0))
 class Inverse:
     """W and W^-1, made when factors without it have cost as much; both in single precision too, when asked for.
 
+    Args:
+        axes: rows of a node; those of different axes are inverted one after the other where W has zeros between them.
+
     Attributes:
         W: rows of it, perhaps with room for more.
         k: number of rows in use.
@@ -25,8 +28,8 @@ class Inverse:
         error: of W W^-1 b over the largest number of b, by the condition of W: some twenty times what it is.
     """
 
-    def __init__(self) -> None:
-        self.W, self.k = NONE, 0
+    def __init__(self, axes: int = 1) -> None:
+        self.W, self.k, self.axes = NONE, 0, axes
         self.forget()
 
     def forget(self) -> None:
@@ -45,15 +48,18 @@ class Inverse:
         """Make W^-1; not where W is singular."""
         if len(self.made):
             return
-        W = self.W[: self.k, : self.k]
-        factor, info = dpotrf(W, lower=1, clean=0)
-        well = dpocon(factor, np.abs(W).sum(axis=0).max(), uplo="L")[0] if info == 0 else 0.0
-        self.error = EPS / well if well > 0 else np.inf
-        inverse, more = dpotri(factor, lower=1, overwrite_c=1) if info == 0 else (factor, info)
-        if more:
-            self.refuse()
-            return
-        self.made = np.ascontiguousarray(np.tril(inverse) + np.tril(inverse, -1).T)
+        W, s = self.W[: self.k, : self.k], self.axes
+        alone = s > 1 and not any(W[a::s, b::s].any() for b in range(s) for a in range(b))
+        most, well, made = np.abs(W).sum(axis=0).max(), 1.0, np.zeros_like(W)
+        for rows in [slice(a, None, s) for a in range(s)] if alone else [slice(None)]:
+            factor, info = dpotrf(W[rows, rows], lower=1, clean=0)
+            well = min(well, dpocon(factor, most, uplo="L")[0]) if info == 0 else 0.0
+            inverse, more = dpotri(factor, lower=1, overwrite_c=1) if info == 0 else (factor, info)
+            if more:
+                self.refuse()
+                return
+            made[rows, rows] = np.tril(inverse) + np.tril(inverse, -1).T
+        self.made, self.error = made, EPS / well if well > 0 else np.inf
 
     def refuse(self) -> None:
         """Do without W^-1 from now on."""

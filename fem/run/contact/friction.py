@@ -237,7 +237,7 @@ class Side:
         if np.array_equal(rows, other.stopped):
             self.A, self.jolt.inverse = other.A, other.jolt.inverse
         else:
-            self.A, self.jolt.inverse = np.ascontiguousarray(A[np.ix_(rows, rows)]), Inverse()
+            self.A, self.jolt.inverse = np.ascontiguousarray(A[np.ix_(rows, rows)]), Inverse(1 + self.jolt.m)
         self.stopped, self.mu = rows.astype(np.intc), mu
         self._point()
         self.jolt.fit(len(rows) // (1 + self.jolt.m))

@@ -42,3 +42,26 @@ def test_an_inverse_tells_its_error(least: float) -> None:
     b = rng.choice([-1.0, 1.0], (k, 20))
     error = np.abs(W @ (inverse.made @ b) - b).max()
     assert error < inverse.error < 1e4 * error  # 3 and 14 times seen: a bound, if no sharp one
+
+
+@pytest.mark.parametrize("coupled", [0.0, 1e-3])
+def test_an_inverse_of_axes_is_that_of_all_rows(coupled: float) -> None:
+    """Axes without each other are inverted one by one, though their conditions differ; coupled ones together."""
+    k, rng = 20, np.random.default_rng(4)
+    W, leasts = np.zeros((3 * k, 3 * k)), (0.5, 1e-4, 0.1)
+    for a, least in enumerate(leasts):
+        Q = np.linalg.qr(rng.standard_normal((k, k)))[0]
+        W[a::3, a::3] = Q * np.geomspace(least, 1.0, k) @ Q.T
+    W[0, 1] = W[1, 0] = coupled * W[1, 1]
+    by_axes, whole = Inverse(3), Inverse()
+    for inverse in (by_axes, whole):
+        inverse.of(W, 3 * k)
+        inverse.make()
+    exact = np.linalg.inv(W)
+    assert np.abs(by_axes.made - exact).max() < 1e-11 * np.abs(exact).max()  # condition 1e4 times rounding
+    assert by_axes.made.flags.c_contiguous
+    assert by_axes.error == pytest.approx(whole.error, rel=0.5)  # both estimate the condition of all rows
+    W[2::3, 2::3] = -np.eye(k)
+    by_axes.of(W.copy(), 3 * k)
+    by_axes.make()
+    assert by_axes.spent == -1.0  # refused
