@@ -16,6 +16,9 @@ from softgrasp.reduction.bases.states import BasisError
 STAGE = 1e-6
 # V'JV = J can be true to about eps |s|^2 only: vectors that are almost J-orthogonal make no pair with each other
 LONGEST = 200.0  # |s|^2 + |t|^2
+# |U'JU| |T'JT| up to which directions U without partner are used together: at 1 [U T] may have no symplectic polar
+# factor, and what then grew left infinite remainders
+BENT = 0.1
 DROP = 0.1  # directions without partner are used together down to this share of the largest
 
 
@@ -153,7 +156,10 @@ class _PairSelection:
         T = -apply_j(U)  # J' U, for which U'JT = U'U = I
         for _ in range(2):
             T = self._complement(T)
-        T = T + U @ symplectic_form(T, T) / 2  # now T'JT = 0 up to U'JU
+        bent = symplectic_form(T, T)
+        if np.linalg.norm(symplectic_form(U, U)) * np.linalg.norm(bent) > BENT:
+            U, T, s, bent = U[:, :1], T[:, :1], s[:1], bent[:1, :1]
+        T = T + U @ bent / 2  # now T'JT = 0 up to U'JU
         S, T = np.hsplit(_symplectic(np.hstack([U, T])), 2)
         self._add(S, T, s * self.norms(U))
 

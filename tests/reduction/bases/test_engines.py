@@ -232,6 +232,23 @@ def test_svd_like_takes_no_pair_of_almost_parallel_lagrangian_vectors(comm: MPI.
     assert gone(S, X) < 1e-12 * np.linalg.norm(X)  # rounding
 
 
+@pytest.mark.parametrize("seed", [151, 188])
+def test_svd_like_splits_directions_that_have_no_polar_factor_together(comm: MPI.Intracomm, seed: int) -> None:
+    """Long pairs and directions without partner: remainders grew to infinity, or columns became dependent."""
+    random, r = np.random.default_rng(seed), 8
+    H = random.normal(size=(2 * r, 2 * r))
+    H = (H + H.T) / 2
+    J = np.eye(2 * r, k=r) - np.eye(2 * r, k=-r)
+    S = scipy.linalg.expm(6.0 * J @ H / np.linalg.norm(H, 2))  # symplectic
+    n = random.integers(2, 5)
+    w = 10.0 ** -np.sort(random.uniform(0, 6, r))
+    X = np.hstack([S[:, :n] * w[:n], S[:, r : r + n] * w[:n], S[:, n:r] * w[n:]])
+    X = X @ np.linalg.qr(random.normal(size=(30, X.shape[1])))[0].T
+    found, _ = svd_like_pairs(comm, X)
+    assert symplectic_error(found) < 1e-9  # rounding of pairs of squared length 1e4
+    assert gone(found, X) < 1e-8 * np.linalg.norm(X)
+
+
 def test_svd_like_stops_at_the_limit_with_the_heaviest_pairs(comm: MPI.Intracomm) -> None:
     X = canonical_matrix(20, 10.0 ** -np.arange(0, 7.5, 0.5), 0)
     S, w = svd_like_pairs(comm, X)
