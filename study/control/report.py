@@ -147,7 +147,12 @@ def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[st
             rows.append(("steps with a load at its limit", f"{100 * full.saturated:.3g} %"))
     if study.controller is not None:
         c = study.controller.controller
-        rows.append(("small controller", f"N = {c.plant.N}, {1e6 * study.tick:.2g} us a tick of {1e3 * c.period:g} ms"))
+        rows.append(
+            (
+                "small controller",
+                f"N = {c.plant.N}, {1e6 * study.tick:.2g} us a tick of {1e3 * c.period:g} ms in Python",
+            )
+        )
     if whole is not None and study.margins is not None:
         low, high, phase = study.margins.together
         up = f"to {high:.3g}" if high < 1e3 else "or more"
