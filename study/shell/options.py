@@ -4,15 +4,45 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from copy import copy
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, get_origin
 
 import typer
+from typer.core import TyperGroup
 
 from softgrasp.fem import SceneError
+from softgrasp.study.shell.ending import rank
+
+# a wrong option or argument, which typer gives no public name
+WRONG: type[BaseException] = typer.BadParameter.__bases__[0]
+
+
+class OneVoice(TyperGroup):
+    """Commands of a program on ranks: of a wrong option rank 0 tells, and all end with status 2."""
+
+    def make_context(self, *given: Any, **extra: Any) -> Any:
+        """See typer."""
+        with _told_once():
+            return super().make_context(*given, **extra)
+
+    def invoke(self, ctx: Any) -> Any:
+        """See typer; the options of a command are read here."""
+        with _told_once():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _told_once() -> Iterator[None]:
+    try:
+        yield
+    except WRONG:
+        if rank() == 0:
+            raise
+        raise typer.Exit(2) from None
 
 
 def parse_folder(text: str) -> Path:

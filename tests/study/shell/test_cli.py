@@ -100,6 +100,13 @@ def test_simulate_writes_what_design_promises(tmp_path: Path, ranks: int) -> Non
     assert run.stdout.count("warning:") == 2
 
 
+@pytest.mark.parametrize("words", [("simulate", "--nonsense"), ("nonsense",)], ids=["option", "command"])
+def test_one_rank_tells_of_a_wrong_word(words: tuple[str, ...]) -> None:
+    run = softgrasp(*words, ranks=2)
+    assert run.returncode == 2
+    assert run.stderr.count("Usage:") == 1
+
+
 REFUSED: list[tuple[tuple[str, ...], tuple[str, ...]]] = [
     (("--set", "tissue.cels=[4,8]"), ("tissue.cels", "tissue.cells")),
     (("--set", "tissue.material.mu=-1.0"), ("tissue.material.mu", "> 0")),
