@@ -148,17 +148,12 @@ class Contact:
     def start(self, state: TissueState, q: Array, n: int = 0) -> None:
         """Look at the state at step n, with the hand at q and no node pressed. Collective.
 
-        Raises SceneError: an obstacle is in the tissue at the start, or the hand holds all of the boundary.
+        Raises SceneError: an obstacle is in the tissue at the start.
         """
         self.z, midpoint = np.array(self.surface.gather(state.z.array_r)), self.midpoint
         if self.surface.B is None:  # else z comes from the nodes in every step
             self.low[:] = self.surface.gather(midpoint.low.array_r[midpoint.operators.rows])
         x = self.surface.places(q, self.z)
-        if not len(x):
-            raise SceneError(
-                "every node of the boundary lies in the contact zone, and none can touch an obstacle; make [contact] "
-                "smaller or set effects.obstacles = false"
-            )
         self.gaps = self._gaps(x, n)
         self.table.gap[n] = self.gaps.min(axis=1)
         self.rows = self._make_rows(np.zeros((0, 2), dtype=int))

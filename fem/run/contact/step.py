@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.surface import refuse_within
 from softgrasp.fem.obstacles.compiled import contact_library
@@ -66,8 +67,18 @@ def make_contact(
 def begin_contact(model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> Contact:
     """The contact that acts on the steps of a midpoint from now on; ``hand``: see `Contact`. Collective.
 
-    Raises SceneError: a path of an obstacle does not fit.
+    Raises SceneError: a path of an obstacle does not fit, or the hand holds all of the boundary.
     """
+    contact = _contact_of(model, midpoint, steps, hand)
+    if not contact.p:
+        raise SceneError(
+            "every node of the boundary lies in the contact zone, and none can touch an obstacle; make [contact] "
+            "smaller or set effects.obstacles = false"
+        )
+    return contact
+
+
+def _contact_of(model: Model, midpoint: TissueMidpoint, steps: int, hand: HandStep | None) -> Contact:
     assert isinstance(midpoint, Touching)
     obstacles = model.scene.obstacle or []
     kind: type[Contact] = Contact

@@ -126,6 +126,12 @@ def test_a_pin_that_only_points_between_nodes_touch_is_not_said_to_be_out_of_rea
     assert not [text for text in explain_model(model).warnings if "stays" in text]
 
 
+def test_a_body_that_is_all_held_is_refused() -> None:
+    model = build("set_down", ["tissue.cells=[4, 3]", "contact={sides=['left', 'right', 'top', 'bottom']}"])
+    with pytest.raises(SceneError, match="every node of the boundary lies in the contact zone"):
+        simulate(model)
+
+
 def test_a_run_begins_with_the_warning_of_a_small_obstacle(tmp_path: Path) -> None:
     pin = "obstacle=[{name='pin', kind='disc', center=[0.5, -0.5], radius=0.1, parts=2}]"
     console = Console(record=True, quiet=False, file=io.StringIO())
