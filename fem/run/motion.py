@@ -142,7 +142,7 @@ def free_table(system: BlockSystem, scene: Scene, dt: float) -> tuple[HandTable,
 
 def driven_table(M_hand: Array, force: Array, dt: float, q0: Array, v0: Array) -> HandTable:
     """Midpoint rule for the free hand M_hand a = u: exact for the given mean forces."""
-    a = np.linalg.solve(M_hand, force.T).T
+    a = np.ascontiguousarray(np.linalg.solve(M_hand, force.T).T)  # a row a step, as C reads the motion
     v = np.vstack([v0, v0 + dt * np.cumsum(a, axis=0)])
     q = np.vstack([q0, q0 + dt * np.cumsum((v[1:] + v[:-1]) / 2, axis=0)])
     return HandTable(q, v, a)

@@ -126,6 +126,19 @@ def test_a_pin_that_only_points_between_nodes_touch_is_not_said_to_be_out_of_rea
     assert not [text for text in explain_model(model).warnings if "stays" in text]
 
 
+def test_a_force_moves_a_hand_that_does_not_feel_the_tissue_onto_a_table() -> None:
+    moved = ["tissue.cells=[6, 4]", "motion={drive='force', target=[0.02, -0.02], duration=0.5}", "time.steps=300"]
+    run = simulate(build("set_down", moved))
+    alone = simulate(build("set_down", [*moved, "effects.obstacles=false", "obstacle=false"]))
+    assert run.contact is not None
+    first = int(run.contact.force.any(axis=(1, 2)).argmax())  # step that touches
+    assert 10 < first < 290
+    assert np.array_equal(run.q_s, alone.q_s)  # no force on this hand
+    assert np.array_equal(run.outputs[: first + 1], alone.outputs[: first + 1])
+    assert abs(run.energy_drift) < 1e-13  # asked for
+    assert run.contact.gap.min() > -1e-12 * 0.1  # asked for, of the body
+
+
 def test_a_body_that_is_all_held_is_refused() -> None:
     model = build("set_down", ["tissue.cells=[4, 3]", "contact={sides=['left', 'right', 'top', 'bottom']}"])
     with pytest.raises(SceneError, match="every node of the boundary lies in the contact zone"):
