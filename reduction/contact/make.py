@@ -37,7 +37,7 @@ NOTHING = 1e-12  # share of static answers outside V that is rounding [1]
 
 
 def contact_model(model: Model, N: int = 30, reach: float | None = None) -> ContactModel:
-    """The tissue in coordinates z = V a + Phi mu, V orthonormal in M, mu the forces of contact. Collective.
+    """The tissue as z = V a + Phi mu, V'M V = I, with what V lacks of answers to contact mu [MacN71]. Collective.
 
     Args:
         model: with ``effects.obstacles`` and a hand that does not feel the tissue.
