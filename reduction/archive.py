@@ -294,7 +294,7 @@ def reading(
         try:
             with h5py.File(no_pipe(path), "r") as file:
                 if file.attrs.get("format") not in (LINEAR, STRAIN, TURNING, TURNING_STRAIN, CONTACT):
-                    raise ModelError(f"{path} is no reduced model of this version ({LINEAR!r}); reduce the scene again")
+                    raise ModelError(f"{path} is no reduced model of this version; reduce the scene again")
                 # one rank reads a reconstruction twice, not all of them
                 for rows in (False, True) if layout is not None and comm.rank == 0 else (False,):
                     if file.attrs[_checksum(file, rows)] != _digest(file, rows):

@@ -20,7 +20,7 @@ from softgrasp.study.identify.command import identify
 from softgrasp.study.serve.command import serve
 from softgrasp.study.shell.ending import console, rank, run_command
 from softgrasp.study.shell.folder import default_folder
-from softgrasp.study.shell.options import OneVoice, parse_tolerance, takes
+from softgrasp.study.shell.options import OneReport, parse_tolerance, takes
 
 RUN, MODEL, LOOK = "Run a scene", "Reduce, control and study", "Scenes, results and installation"  # groups of --help
 EPILOG = """[bold]Examples[/bold]
@@ -43,7 +43,7 @@ softgrasp reduce paper_forward --tolerance 1e-2
 
 3: an answer is refused, of query above its tolerance, of identify with its reason."""
 app = typer.Typer(
-    cls=OneVoice,
+    cls=OneReport,
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,

@@ -352,7 +352,7 @@ SENTENCES: list[tuple[Act, str]] = [
     (batch("mu\n" + 200_000 * "1"), "b.csv: field larger than field limit (131072)"),
     (scene("'a$b'=1"), "is no key; a key has 1 to "),
     (dissected, "the matrix does not have the pattern that was dissected"),
-    (other_model("format", "softgrasp 0"), "a.h5 is no reduced model of this version ("),
+    (other_model("format", "softgrasp 0"), "a.h5 is no reduced model of this version; reduce the scene again"),
     (other_model("", "", scene_hash="0" * 64), "a.h5 was made for another scene (hash "),
     (lambda *_: _check(made()[0].system.layout, made()[0].system, WRONG_SHAPES), "snapshots have the shapes (3, 2), "),
     (unmixed, "a canonical model contains M_ee^-1 and accepts densities that all change by one factor; "),

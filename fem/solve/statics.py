@@ -149,9 +149,9 @@ def finite_equilibrium(system: BlockSystem, solver: SolverName | None = None) ->
     body.refuse(body.start(z), comm)
     if name not in ITERATIVE and not _stable(body, system, name, z):
         raise SolverError(
-            f"finite strain ({body.law.name}): the equilibrium under gravity is unstable (its tangent is not positive "
-            "definite), as that of a column that buckles: use a stiffer material or a stouter tissue, or time.start = "
-            "'rest'"
+            f"finite strain ({body.law.name}): the equilibrium under gravity that was found is unstable (its tangent "
+            "is not positive definite), as that of a column that buckles: use a stiffer material or a stouter tissue, "
+            "or time.start = 'rest'"
         )
     for item in (z, f, load):
         item.destroy()

@@ -58,7 +58,7 @@ class Actuation:
             fitting = 1.0 / (self.rate * max(1, int(np.ceil(ratio - 1e-6))))
             raise ControlError(
                 f"rate = {self.rate:g} Hz means ticks of {1 / self.rate:g} s, which is no multiple of the time step "
-                f"{dt:g} s; raise time.steps by {dt / fitting:.6g} times, to steps of {fitting:g} s, for example"
+                f"{dt:g} s; multiply time.steps by {dt / fitting:.6g}, to steps of {fitting:g} s, for example"
             )
         return count
 

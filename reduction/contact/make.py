@@ -9,12 +9,14 @@ import time
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from softgrasp.fem.model.outputs import make_outputs, output_columns
-from softgrasp.fem.model.surface import Surface, make_surface, node_distance
+from softgrasp.fem.model.surface import Surface, node_distance
 from softgrasp.fem.obstacles import HalfSpace, Obstacle, make_obstacles
 from softgrasp.fem.petsc import Array, normalising, times_columns, total
 from softgrasp.fem.run.contact.expected import nearest_gaps
+from softgrasp.fem.run.contact.general import contact_surface
 from softgrasp.fem.run.midpoint import viscosity
 from softgrasp.fem.run.motion import motion_table
 from softgrasp.fem.solve.modes import lowest_modes
@@ -43,9 +45,10 @@ def contact_model(model: Model, N: int = 30, reach: float | None = None) -> Cont
         model: with ``effects.obstacles`` and a hand that does not feel the tissue.
         N: number of columns of V, at most: the response to the hand, and those that a rich model needs beside it on
             the motion of the scene and on others like it.
-        reach: boundary nodes that come nearer than this to an obstacle while the undeformed body follows the hand of
-            the scene may touch [m]; None: half the distance of boundary nodes. Of nodes behind each other the foremost
-            may. A run in which another node enters an obstacle is refused.
+        reach: boundary nodes, and points between them at which full runs touch, may touch if they come nearer than
+            this to an obstacle while the undeformed body follows the hand of the scene [m]; None: half the distance of
+            boundary nodes. Of points behind each other the foremost may. A run in which another enters an obstacle is
+            refused.
 
     Raises:
         ModelError: the scene has other obstacles, no contact or a two-way hand, or no node comes within reach, or N has
@@ -71,18 +74,19 @@ def rich_model(model: Model, reach: float | None = None) -> ContactModel:
     layout, obstacles = system.layout, check_contact_scene(model)
     comm, n_s, seconds, begin = layout.comm, layout.n_s, dict[str, float](), time.perf_counter()
     surface, table, dt = (
-        make_surface(model.space, system),
+        contact_surface(model),
         motion_table(scene, layout.n_s),
         scene.time_end / scene.time.steps,
     )
     near = node_distance(model.space) / 2 if reach is None else reach
-    kept = np.flatnonzero(nearest_gaps(surface, obstacles, table.q, dt, len(table.q)).min(axis=0) < near)
+    reached = nearest_gaps(surface, obstacles, table.q, dt, len(table.q)) < near
+    kept = np.flatnonzero(reached.any(axis=0))
     if not len(kept):
         raise ModelError(f"no boundary node comes within reach = {near:.3g} m of an obstacle; give a larger reach")
-    kept = foremost(surface.X, kept, obstacles, near)
-    forces = _forces(layout.n_local, surface, kept, obstacles)
+    kept = foremost(surface.X, kept, obstacles, reached[:, kept], near)
+    normals, which = np.unique([plane(o)[0] for o in obstacles], axis=0, return_inverse=True)
+    forces = _forces(layout.n_local, surface, kept, normals)
     answers = static_columns(system, np.asfortranarray(np.hstack([system.G, forces])))
-    normals = np.unique([plane(o)[0] for o in obstacles], axis=0)
     shapes = [
         lowest_modes(system, min(MODES, layout.n_e))[1],
         *(_landing(system, surface, kept, normals, s * 2 / dt) for s in LANDING),
@@ -101,7 +105,10 @@ def rich_model(model: Model, reach: float | None = None) -> ContactModel:
     y = output_columns(outputs, layout.n_local).T
     on = np.zeros((len(surface.dofs), V.shape[1] + Phi.shape[1]))
     on[surface.mine] = np.hstack([V, Phi])[surface.rows]
-    on = total(comm, on)
+    on = np.column_stack([surface.at_points(x) for x in total(comm, on).T])
+    rows = (which[:, None] * len(kept) + np.arange(len(kept))).ravel()  # obstacles of one normal share their answers
+    on = np.hstack([on[:, : len(stiffness)], on[:, len(stiffness) + rows]])
+    Phi = Phi[:, rows]
     seconds["projection"] = time.perf_counter() - begin
     return ContactModel(
         stiffness, (D + D.T) / 2, total(comm, V.T @ system.G), total(comm, y @ V), np.vstack([o.C_s for o in outputs]),
@@ -128,28 +135,31 @@ def check_contact_scene(model: Model) -> tuple[Obstacle, ...]:
     return obstacles
 
 
-def foremost(X: Array, kept: Ints, obstacles: tuple[Obstacle, ...], distance: float) -> Ints:
-    """The kept nodes with no other one straight before them at rest, towards the obstacle that is nearest to them."""
-    gaps = np.array([o.gap(X[kept]) for o in obstacles])
-    first = np.ones(len(kept), dtype=bool)
-    for j, o in enumerate(obstacles):
-        n, mine = plane(o)[0], gaps.argmin(axis=0) == j
-        beside = X[kept] - gaps[j][:, None] * n
-        before = gaps[j][None, :] < gaps[j][:, None] - distance
+def foremost(
+    X: Array, kept: Ints, obstacles: tuple[Obstacle, ...], reached: NDArray[np.bool_], distance: float
+) -> Ints:
+    """The kept points with no other one straight before them at rest, towards an obstacle that they reach.
+
+    ``reached``: whether each comes near to each obstacle, (obstacles, kept).
+    """
+    first = np.zeros(len(kept), dtype=bool)
+    for o, reaches in zip(obstacles, reached, strict=True):
+        gap = o.gap(X[kept])
+        beside = X[kept] - gap[:, None] * plane(o)[0]
         close = np.linalg.norm(beside[:, None] - beside[None], axis=2) < distance
-        first &= ~(mine & (before & close).any(axis=1))
+        first |= reaches & ~((gap[None, :] < gap[:, None] - distance) & close).any(axis=1)
     return kept[first]
 
 
-def _forces(n_local: int, surface: Surface, kept: Ints, obstacles: tuple[Obstacle, ...]) -> Array:
-    """N' of the rows: a unit force on each node from each obstacle, local rows (n_local, rows)."""
+def _forces(n_local: int, surface: Surface, kept: Ints, normals: Array) -> Array:
+    """A unit force on each point along each normal, local rows (n_local, normals x points)."""
     d, nodes = surface.X.shape[1], len(kept)
-    whole = np.zeros((len(surface.dofs), len(obstacles) * nodes))
-    for j, o in enumerate(obstacles):
-        for a, component in enumerate(plane(o)[0]):
+    whole = np.zeros((surface.X.size, len(normals) * nodes))
+    for j, normal in enumerate(normals):
+        for a, component in enumerate(normal):
             whole[kept * d + a, j * nodes + np.arange(nodes)] = component
     result = np.zeros((n_local, whole.shape[1]), order="F")
-    result[surface.rows] = whole[surface.mine]
+    result[surface.rows] = np.column_stack([surface.on_nodes(x) for x in whole.T])[surface.mine]
     return result
 
 
@@ -158,7 +168,8 @@ def _landing(system: BlockSystem, surface: Surface, kept: Ints, normals: Array, 
     layout, d = system.layout, surface.X.shape[1]
     moved = times_columns(system.M_ee, np.asfortranarray(np.tile(normals.T, (layout.n_local // d, 1))))
     there, loads = np.zeros(len(surface.dofs), dtype=bool), np.zeros_like(moved, order="F")
-    there[(kept[:, None] * d + np.arange(d)).ravel()] = True
+    at = kept if surface.B is None else surface.weights(kept)[0]
+    there[(at[:, None] * d + np.arange(d)).ravel()] = True
     rows = surface.rows[there[surface.mine]]
     loads[rows] = moved[rows]
     solver = make_solver(dynamic_stiffness(system, s), static_solver(system), layout, PREFIX, rtol=1e-12)

@@ -21,6 +21,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import HandTable
 from softgrasp.fem.shown import Card, Shown, amount, counted
 from softgrasp.reduction.contact.stepper import ContactSteps
+from softgrasp.reduction.online import checked_hand
 from softgrasp.reduction.origin import MOTION, check_origin
 from softgrasp.reduction.system import ModelError
 
@@ -88,7 +89,7 @@ class ContactModel(Shown):
     C_s: Array
     """Rigid part of the outputs, (components, n_s)."""
     X: Array
-    """Coordinates of the boundary nodes at rest, (p, d) [m]."""
+    """Coordinates at rest of the boundary nodes and the points between them that can touch, (p, d) [m]."""
     T: Array
     """Rigid modes of the hand there, (p d, n_s) [1, m]."""
     on_surface: Array
@@ -98,9 +99,9 @@ class ContactModel(Shown):
     C_Phi: Array
     """C'Phi of the outputs, (components, rows)."""
     lag: float
-    """Kelvin-Voigt time of Phi, tr Phi'D Phi / tr Phi'K Phi [s]."""
+    """Kelvin-Voigt time of Phi [s], tr Phi'D Phi / tr Phi'K Phi; in layers of other damping without products with V."""
     kept: Ints
-    """Numbers of the boundary nodes that have rows, (nodes,)."""
+    """Numbers of those points that have rows, (nodes,)."""
     obstacles: tuple[Obstacle, ...]
     """Half-spaces."""
     fall: Array
@@ -188,9 +189,13 @@ class ContactModel(Shown):
             engine: "C" or "NumPy"; empty takes C where there is a compiler.
 
         Raises:
-            ModelError: a boundary node without a row enters an obstacle, or the tissue starts in one.
+            ModelError: a boundary node without a row enters an obstacle, the tissue starts in one, or the hand's tables
+                do not fit.
             SolverError: the contact problem of a step has no solution.
         """
+        q, v = checked_hand((q, v), self.G.shape[1])
+        if not (np.isfinite(dt) and dt > 0 and np.isfinite(q).all() and np.isfinite(v).all()):
+            raise ModelError(f"dt = {dt:g} s must be > 0, and the hand's positions and velocities finite numbers")
         d, steps = self.X.shape[1], len(q) - 1
         c = -(np.diff(v, axis=0) / dt - self.fall + self.drag * (v[1:] + v[:-1]) / 2)
         start = self.G @ self.fall / self.stiffness if self.equilibrium else np.zeros(self.N)

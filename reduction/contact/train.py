@@ -1,7 +1,7 @@
 """Reduced models with contact of N columns, by a rich one that a few motions train.
 
 The rich model has many modes, so that its runs take milliseconds. What moves in them beside the static answers to the
-forces is x = a - Lambda^-1 N'mu; V of N columns spans K^-1 G and the directions R that need most of it,
+forces is x = a - Lambda^-1 N'mu; V of N columns spans K^-1 G and the directions R that hold most of it,
 
     minimise over R  sum_runs c |P x|_W^2,   x and SPEED v, each over the norm of a or v in the run,   W = Lambda^(1/2),
 
@@ -41,7 +41,7 @@ class Training:
     seconds: float  # time of the runs [s]
 
     def model(self, N: int) -> ContactModel:
-        """The model of at most N columns that needs these motions. Collective.
+        """The model of the N columns, at most, that these motions need. Collective.
 
         Raises ModelError: N has no room for the hand and a few more.
         """

@@ -21,22 +21,22 @@ from softgrasp.study.shell.ending import rank
 WRONG: type[BaseException] = typer.BadParameter.__bases__[0]
 
 
-class OneVoice(TyperGroup):
-    """Commands of a program on ranks: of a wrong option rank 0 tells, and all end with status 2."""
+class OneReport(TyperGroup):
+    """Commands of a program on ranks: rank 0 alone reports a wrong option, and all end with status 2."""
 
     def make_context(self, *given: Any, **extra: Any) -> Any:
         """See typer."""
-        with _told_once():
+        with _reported_once():
             return super().make_context(*given, **extra)
 
     def invoke(self, ctx: Any) -> Any:
         """See typer; the options of a command are read here."""
-        with _told_once():
+        with _reported_once():
             return super().invoke(ctx)
 
 
 @contextmanager
-def _told_once() -> Iterator[None]:
+def _reported_once() -> Iterator[None]:
     try:
         yield
     except WRONG:

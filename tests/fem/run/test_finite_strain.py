@@ -37,7 +37,7 @@ from tests.helpers.models import (
 LAWS = ("neo-hooke", "neo-hooke-quadratic", "stvk")
 GENTLE = {"motion": {"target": [1.0, 0.6]}}
 VISCOUS = {"damping": {"kind": "rayleigh", "alpha": 0.4, "beta": 0.01}}
-UNSTABLE = "the equilibrium under gravity is unstable"
+UNSTABLE = "the equilibrium under gravity that was found is unstable"
 STRIP: dict[str, Any] = {
     "tissue": {"size": [0.3, 2.0], "cells": [2, 10]},
     "contact": {"sides": ["top"], "box": [[0.0, 0.0], [0.3, 2.0]]},
